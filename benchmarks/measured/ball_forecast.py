@@ -124,7 +124,7 @@ def _drawn(
     noise = declared_noise(rivals.model.noise, m)
     last, *rest = _rest(rivals, m, trial)
     rho = np.stack([noise.cells[c].rho for c in cells])
-    sd = np.stack([noise.cells[c].sd for c in cells]) * sizes
+    sd = np.stack([noise.cells[c].sd for c in cells]) * sizes[:, None]
     r = m.x[last] - mean[:, last]
     x = np.empty((num, len(rest)))
     for j, k in enumerate(rest):

@@ -26,12 +26,11 @@ from sbi_active.criticism.effects.joint_prior import joint_prior
 from sbi_active.criticism.effects.summaries import MANY, MOST, obstacle, summarize
 from sbi_active.criticism.evidence.rival_set import RivalSet
 from sbi_active.criticism.linear.screening import linear_models
-from sbi_active.criticism.misfit.contrary import widened
+from sbi_active.criticism.misfit.contrary import judged, widened
 from sbi_active.criticism.misfit.evaluation import evaluate_held_out, evaluate_left_out
 from sbi_active.criticism.misfit.record import traced
 from sbi_active.criticism.misfit.rule import Rule
 from sbi_active.criticism.misfit.verdict import Verdict, judge
-from sbi_active.criticism.misfit.wider_prior import judged
 from sbi_active.criticism.next_trial.next_action import choose_action
 from sbi_active.criticism.results import (
     Detection,
@@ -177,9 +176,8 @@ class Criticism:
     def _models(self) -> RivalSet:
         model, trials, effects = self._parts
         own = model, self.prior, trials.fit, effects
-        return RivalSet(
-            *own, actions=self.actions, seed=self.seed, warm_up=self._warm_up
-        )
+        options = {"actions": self.actions, "warm_up": self._warm_up}
+        return RivalSet(*own, seed=self.seed, **options)
 
     @cached_property
     def _verdict(self) -> Verdict:
@@ -230,8 +228,7 @@ class Criticism:
             return ()
         if self._equivalent is None:
             with stage("effects told apart", show_progress=self.show_progress):
-                found = equivalent_effects(self._search.rivals, self.actions)
-                self._equivalent = found
+                self._equivalent = equivalent_effects(self._search.rivals, self.actions)
         return self._equivalent
 
     def detect(self) -> Detection:
@@ -245,14 +242,12 @@ class Criticism:
     @cached_property
     def _traced(self) -> tuple[Tracing, RivalSet]:
         found, large = self._verdict, self._is_large
-        # Each model's held-out errors would take as much as the verdict; and what
-        # separates effects of a large library, the next action looks for.
+        # Each model's held-out errors would take as much as the verdict.
         held_out = None if large else self._parts[1].held_out
-        actions = None if large else self.actions
         with stage("verdict, sets of effects fitted", show_progress=self.show_progress):
-            tracing, models = traced(found, held_out, actions=actions, near=not large)
+            tracing, models = traced(found, held_out, near=not large)
         if tracing.misfit is None:
-            tracing = widened(tracing, self.seed, models.within)
+            tracing = widened(tracing, models)
         return replace(tracing, set_aside=self.set_aside), models
 
     def add(
@@ -315,17 +310,13 @@ class Criticism:
     @cached_property
     def _evaluation(self) -> Evaluation | None:
         tracing, trials = self.trace(), self._parts[1]
-        num = FEW_DRAWS if self._is_large else NUM_DRAWS
+        options = {"num_draws": FEW_DRAWS if self._is_large else NUM_DRAWS}
         if (held_out := trials.held_out) is not None:
-            return evaluate_held_out(self.rivals, tracing, held_out, num_draws=num)
+            return evaluate_held_out(self.rivals, tracing, held_out, **options)
         if int(self.trials.valid.sum()) < FEWEST_TRIALS:
             return None
-        shown = self.show_progress
-        return evaluate_left_out(
-            *(self._verdict, self.rivals, trials.fit),
-            num_draws=num,
-            show_progress=shown,
-        )
+        shown, given = self.show_progress, (self._verdict, self.rivals, trials.fit)
+        return evaluate_left_out(*given, show_progress=shown, **options)
 
     def judged(self, evaluation: Evaluation | None) -> Tracing:
         """Return the tracing, unless trials that had no part in it speak against it.
@@ -360,14 +351,10 @@ class Criticism:
         """
         from sbi_active.criticism.reporting import report_of
 
-        held_out = self._parts[1].held_out
         evaluation = self.evaluate() if evaluate else None
-        return report_of(
-            *(self, evaluation, held_out),
-            plan=plan,
-            designed=designed,
-            exploratory=exploratory,
-        )
+        own = self, evaluation, self._parts[1].held_out
+        options = {"designed": designed, "exploratory": exploratory}
+        return report_of(*own, plan=plan, **options)
 
 
 def _without(trials: Trials, outlying: Sequence[OutlyingTrial]) -> Trials:

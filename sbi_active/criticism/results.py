@@ -228,9 +228,6 @@ class Tracing:
         equivalent: Groups of names that no permitted action separates ("none" for an
             effect that shows nowhere).
         near: Groups for the trials at hand alone; another action may separate them.
-        aliases: After an alarm, pairs of effects that explain the data about as well
-            (log evidence within log 20 of the best) with predictions closer than the
-            noise over the permitted actions; repeated trials may separate them.
         estimates: Estimates, one an effect, most probable first.
         evidences: Evidence of every model tried, by name. Priors of effects have
             unknown scale.
@@ -270,7 +267,6 @@ class Tracing:
     credible_set: tuple[str, ...]
     equivalent: tuple[frozenset[str], ...]
     near: tuple[frozenset[str], ...]
-    aliases: tuple[frozenset[str], ...]
     estimates: tuple[Estimate, ...]
     evidences: dict[str, Evidence]
     robust: bool

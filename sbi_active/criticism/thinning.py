@@ -7,8 +7,8 @@ import numpy as np
 from sbi_active.criticism.data.sampling import Sampling, suggested_sampling, thinned
 from sbi_active.criticism.data.trials import Trials
 from sbi_active.criticism.evidence.rival_set import RivalSet
+from sbi_active.criticism.linear.fits import sensor_of
 from sbi_active.criticism.linear.search import Search
-from sbi_active.criticism.linear.sensor import sensor_of
 from sbi_active.criticism.report.words import caution
 from sbi_active.criticism.results import ModelKey
 from sbi_active.criticism.rivals.noise_grid import measurement_sds

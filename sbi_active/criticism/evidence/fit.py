@@ -1,4 +1,4 @@
-"""A rival with its posterior and its evidence."""
+"""A rival with its posterior, and what is spent on it."""
 
 from __future__ import annotations
 
@@ -13,8 +13,9 @@ from sbi_active.criticism.results import Evidence
 from sbi_active.criticism.rivals.error_models import NoiseGrid
 from sbi_active.criticism.rivals.residual_process import ResidualProcess
 from sbi_active.criticism.rivals.rival import Rival
-from sbi_active.inference.engine import Fit as Sampled
 from sbi_active.inference.engine import WeightedDraws
+from sbi_active.inference.engine.search import SearchSettings
+from sbi_active.inference.engine.settings import Settings
 from sbi_active.inference.sampling.weights import effective_sample_size, normalized
 
 
@@ -28,7 +29,8 @@ class Fit:
         evidence: Evidence that is recorded of it.
         best: Point from which other trials are predicted, shape (dim,); None takes the
             draws.
-        mode: Point at which it is linear, shape (dim,); None if it was sampled.
+        mode: Point at which it is linear, or of the largest density of a sample, shape
+            (dim,); None where effects on the noise are drawn beside it.
         linear: Function from u (n, dim) to the residuals (n, N) of the linear model
             that draws are of; None if they are of the simulator's own posterior.
         known: Mask of the numbers that it is fitted to, shape (N,); None for all.
@@ -52,22 +54,12 @@ class Fit:
         return error.part(self.known)
 
     @property
-    def likeliest(self) -> Array:
-        """The mode or the draw of the largest density, shape (1, dim)."""
-        if self.mode is not None:
-            return self.mode[None]
-        own = self.sample
-        best = own.u[[int(np.argmax(own.weight))]]
-        if not isinstance(own, Sampled) or own.found is None:
-            return best
-        u = np.concatenate([best, own.found.modes[:1]])
-        log_p = self.rival.log_prior(u) + self.rival.log_likelihood(u)
-        return u[[int(np.argmax(log_p))]]
-
-    @property
     def point(self) -> Array:
         """The point from which one prediction is made, shape (dim,)."""
-        return self.likeliest[0] if self.best is None else self.best
+        if self.best is not None:
+            return self.best
+        own = self.sample
+        return own.u[int(np.argmax(own.weight))] if self.mode is None else self.mode
 
     def weighed(
         self, u: Array, residual: Array, rng: np.random.Generator
@@ -104,3 +96,46 @@ def tempered(log_w: Array, fewest: float) -> Array:
     while effective_sample_size(power * log_w) < fewest:
         power *= 0.8
     return normalized(power * log_w)
+
+
+#: Searches from draws of the prior alone. A wrong model explains nothing, so that no
+#: number of searches is asked to.
+THOROUGH = SearchSettings(
+    num_screened=128, max_starts=48, explained=0.0, phases=10, num_kept=8
+)
+#: Searches with a fit to begin at.
+NESTED = SearchSettings(
+    num_screened=32,
+    num_starts=4,
+    max_starts=12,
+    num_found=1,
+    explained=0.0,
+    iterations=6,
+    phases=10,
+)
+
+
+def settings_of(num_trials: int, *, is_bare: bool) -> Settings:
+    """Return the settings of what is spent on a model.
+
+    The bare model is every comparison's other side, and its posterior is shown; an
+    evidence that is off by a seventh of a nat decides as well as a better one.
+
+    Args:
+        num_trials: Number of simulated trials in a row.
+        is_bare: Whether it is the model without effects.
+    """
+    most = 3_000  # rows of all trials
+    if is_bare:
+        return Settings(plenty=4.0, num_simulations=3 * most * num_trials)
+    return Settings(
+        num_effective=50.0,
+        plenty=1.0,
+        divergence=np.inf,
+        num_draws=100,
+        fewest=25.0,
+        affordable=5.0,
+        broad=60.0,
+        share_of_plenty=0.0,
+        num_simulations=most * num_trials,
+    )

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from sbi_active.arrays import Array
-from sbi_active.criticism.evidence.settings import THOROUGH
+from sbi_active.criticism.evidence.fit import THOROUGH
 from sbi_active.criticism.rivals.error_models import NoiseGrid
 from sbi_active.criticism.rivals.rival import Rival
 from sbi_active.inference.engine import search
@@ -65,7 +65,7 @@ def probe_step(rival: Rival, u: Array) -> tuple[float | None, bool]:
         rival: The bare model.
         u: Places, shape (n, dim).
     """
-    whiten, coarse = rival.error.start(), 5e-2
+    whiten, coarse = rival.whitener(), 5e-2
 
     def slope(step: float) -> Array:
         return rival.jacobian(u, whiten, step)[1]

@@ -18,9 +18,8 @@ from sbi_active.criticism.data.measurements import Measurements
 from sbi_active.criticism.data.trials import Trials
 from sbi_active.criticism.effects.augmented import AugmentedSimulator
 from sbi_active.criticism.effects.effect import Effect
-from sbi_active.criticism.evidence.fit import Fit
+from sbi_active.criticism.evidence.fit import NESTED, THOROUGH, Fit, settings_of
 from sbi_active.criticism.evidence.jumps import STEPS, look_for_jumps
-from sbi_active.criticism.evidence.settings import NESTED, ROUGH, THOROUGH, settings_of
 from sbi_active.criticism.results import SCATTER, UNEXPLAINED, Evidence, ModelKey
 from sbi_active.criticism.rivals.coordinates import SearchCoordinates
 from sbi_active.criticism.rivals.error_models import NoiseGrid
@@ -28,7 +27,7 @@ from sbi_active.criticism.rivals.noise_grid import declared_noise, scattered
 from sbi_active.criticism.rivals.residual_process import ResidualProcess
 from sbi_active.criticism.rivals.rival import Rival
 from sbi_active.criticism.rivals.trial_simulator import NUM_REPLICATES, TrialSimulator
-from sbi_active.inference.engine import Found, WeightedDraws, infer, search
+from sbi_active.inference.engine import WeightedDraws, infer, search
 from sbi_active.seeding import derive_seed
 from sbi_active.simulation import SimulatorModel
 
@@ -89,9 +88,9 @@ class RivalSet:
         self.simulator = TrialSimulator(augmented, trials, seed=seed_of_trials)
         self.measurements = self.simulator.measurements
         self._factors: tuple[Array, Array] | None = None
+        self._sizes: Sequence[Array] = ()
         self.noise = self.noise_of(self.measurements)
         self._predictives: dict[tuple[bytes | None, ...], tuple[Array, Array]] = {}
-        self._modes: dict[tuple[ModelKey, bytes], Found] = {}
         self.fits: Mapping[ModelKey, Fit] = {}
         self.center, self.spread = self.prior_predictive(self.simulator)
         # Beyond a thousand deviations of the prior predictive a number is as far.
@@ -125,17 +124,30 @@ class RivalSet:
             largest: Largest value of their unknown factor, which is log-uniform from
                 one.
         """
-        new = self.with_fits({})
         factors = np.geomspace(1.0, max(largest, 2.0), 14)
-        new._factors = factors, np.full(len(factors), -np.log(len(factors)))
-        new.noise, new._modes = self.noise.scaled(*new._factors), {}
+        log_p = np.full(len(factors), -np.log(len(factors)))
+        return self._with_noise(_factors=(factors, log_p))
+
+    def with_sizes(self, sizes: Sequence[Array]) -> RivalSet:
+        """Return these models with errors of one of some sizes by channel, (c,)."""
+        return self._with_noise(_sizes=sizes)
+
+    def _with_noise(self, **own: Any) -> RivalSet:
+        new = self.with_fits({})
+        vars(new).update(own)
         vars(new).pop("_process", None)  # which has that noise
+        new.noise = new.noise_of(new.measurements)
+        if new.roughness.any():
+            new.noise = new.noise.with_extra(new.roughness)
         return new
 
     def noise_of(self, measurements: Measurements) -> NoiseGrid:
         """Return the errors of some measurements."""
         seed = derive_seed(self.seed, "noise")
         noise = declared_noise(self.model.noise, measurements, seed=seed)
+        if self._sizes:
+            sizes = [np.maximum(size, 1e-300) for size in self._sizes]
+            noise = noise.sized([size[measurements.channel] for size in sizes])
         return noise if self._factors is None else noise.scaled(*self._factors)
 
     def rival(
@@ -180,17 +192,10 @@ class RivalSet:
         noise = self.model.noise
         return noise is not None and noise.is_known_gaussian and self.noise.is_known
 
-    def within(self, key: ModelKey, z: Array) -> Array:
-        """Return draws of a model, (n, d), moved into the bounds of its prior."""
-        return self.rival(key).coordinates.within(z)
-
     @cached_property
     def _process(self) -> ResidualProcess:
-        noise = self.noise
-        if noise.channel is not None:
-            best = self.fit().likeliest
-            noise = noise.settled(self.rival(ModelKey()).residual(best)[0][0])
-        return self.residual_process(noise, np.ones(len(self.measurements), bool))
+        every = np.ones(len(self.measurements), dtype=bool)
+        return self.residual_process(self.noise, every)
 
     def residual_process(
         self, noise: NoiseGrid, at: NDArray[np.bool_]
@@ -251,18 +256,6 @@ class RivalSet:
         found = self.fits.get(key)
         return self.sampled(key) if found is None else found
 
-    def search(self, key: ModelKey, near: Array | None = None) -> Found:
-        """Return the modes of a rival, computed once, see :meth:`sampled`."""
-        asked = key, b"" if near is None else near.tobytes()
-        if asked not in self._modes:
-            rng = np.random.default_rng(derive_seed(self.seed, "search", str(key)))
-            how = THOROUGH if near is None else NESTED
-            how = how if self.is_smooth else ROUGH
-            found = search(self.rival(key), rng, near, how)
-            assert found is not None  # residuals are bounded
-            self._modes[asked] = found
-        return self._modes[asked]
-
     def sampled(self, key: ModelKey, near: Array | None = None) -> Fit:
         """Return one rival with a sample of its posterior and its evidence.
 
@@ -274,7 +267,9 @@ class RivalSet:
         rival, seed = self.rival(key), derive_seed(self.seed, "evidence", str(key))
         repeats = NUM_REPLICATES if self.simulator.is_stochastic else 1
         settings = settings_of(len(self.trials) * repeats, is_bare=key == ModelKey())
-        rng, found = np.random.default_rng(seed), self.search(key, near)
+        rng = np.random.default_rng(derive_seed(self.seed, "search", str(key)))
+        found = search(rival, rng, near, THOROUGH if near is None else NESTED)
+        rng = np.random.default_rng(seed)
         sample = infer(rival, rng, found=found, settings=settings)
         if not len(sample.u):  # nothing has a likelihood
             u = rival.sample_prior(NUM_DRAWS, rng)
@@ -283,11 +278,19 @@ class RivalSet:
         drawn = sample.draws(NUM_DRAWS, np.random.default_rng(seed))
         best = sample.u[np.argsort(sample.weight)[-20:]]
         residual = rival.residual(best, penalized=False)[0]
-        square = [(rival.error.whitener(r)(r) ** 2).sum() for r in residual]
-        return Fit(rival, sample, self.record(rival, sample, drawn, float(min(square))))
+        square = min((rival.noise.whitener(r)(r) ** 2).sum() for r in residual)
+        evidence = self.record(rival, sample, drawn, float(square))
+        u = best[-1:] if found is None else np.r_[best[-1:], found.modes[:1]]
+        log_p = rival.log_prior(u) + rival.log_likelihood(u)
+        return Fit(rival, sample, evidence, mode=u[int(np.argmax(log_p))])
 
     def record(
-        self, rival: Rival, sample: WeightedDraws, u: Array, chi_square: float
+        self,
+        rival: Rival,
+        sample: WeightedDraws,
+        u: Array,
+        chi_square: float,
+        best: Array | None = None,
     ) -> Evidence:
         """Return the record of a rival.
 
@@ -296,8 +299,9 @@ class RivalSet:
             sample: Sample of its posterior.
             u: Draws that are shown, shape (n, dim).
             chi_square: Smallest whitened residual sum of squares.
+            best: Point from which other trials are predicted; None for the draws.
         """
-        own = sum(rival.coordinates.joint.sizes)
+        c, own = rival.coordinates, rival.coordinates.num_own
         return Evidence(
             key=rival.key,
             log_evidence=sample.log_evidence,
@@ -305,7 +309,8 @@ class RivalSet:
             effective_sample_size=sample.effective_sample_size,
             engine=sample.method,
             names=self.names_of(rival),
-            draws=rival.coordinates.to_z(u)[:, :own],
+            draws=c.to_z(u)[:, :own],
+            best=None if best is None else c.to_z(best[None])[0, :own],
             best_chi_square=chi_square,
         )
 

@@ -16,9 +16,8 @@ from sbi_active.criticism.data.trials import Trials
 from sbi_active.criticism.effects.effect import Effect
 from sbi_active.criticism.effects.trial_conditions import conditions_for
 from sbi_active.criticism.evidence.fit import tempered
-from sbi_active.criticism.identification.fitting import Fitted, fitted
+from sbi_active.criticism.identification.fitting import Fitted, fitted, spread
 from sbi_active.criticism.identification.settings import IdentifySettings
-from sbi_active.criticism.identification.spread import spread
 from sbi_active.expected import suggests
 from sbi_active.inference.beliefs.diagnostics import Diagnostics
 from sbi_active.inference.beliefs.weighted import KernelBelief

@@ -12,16 +12,13 @@ eigenvectors of its precision.
 
 References:
     George & McCulloch, Statistica Sinica 7 (1997), for the presence of variables.
-    Goodnight, The American Statistician 33 (1979), for the sweep operator.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from copy import copy
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -60,6 +57,10 @@ class Unknowns:
     def num_effects(self) -> int:
         """Number of doubtful effects."""
         return int(self.effect.max(initial=-1)) + 1
+
+    def free(self, present: Flags) -> Flags:
+        """Return the coordinates that are not zero, (n, d), by present effects."""
+        return np.insert(present, present.shape[1], True, axis=1)[:, self.effect]
 
     @property
     def log_density(self) -> Array:
@@ -115,30 +116,29 @@ class Sampler:
         Args:
             sweeps: Sweeps of each chain, after those that are left out.
         """
-        p, own, d = self.unknowns, self.settings, len(self.unknowns.low)
-        ridge = p.precision + own.flat / (p.high - p.low) ** 2
-        u = np.clip(np.zeros((own.chains, d)), p.low, p.high)
+        p, own = self.unknowns, self.settings
+        u = np.clip(np.zeros((own.chains, len(p.low))), p.low, p.high)
         present = np.ones((own.chains, p.num_effects), dtype=bool)
         kept: list[tuple[Array, ...]] = []
         for sweep in range(own.burnt + sweeps):
-            shape = own.chains, d, d
-            precision = np.broadcast_to(np.diag(ridge), shape).copy()
-            linear = np.broadcast_to(p.precision * p.center, u.shape).copy()
-            errors = [self._errors(c, u) for c in range(len(self.known_size))]
-            for c, (h, variance) in enumerate(errors):
-                gram = self.grams.gram[h, c] / variance[:, None, None]
-                precision += gram[:, 1:, 1:]
-                linear -= gram[:, 1:, 0]
-            swept = _Swept(precision, linear).turned(np.flatnonzero(p.effect < 0))
-            for e, there in enumerate(present.T):
-                swept[there] = swept[there].turned(np.flatnonzero(p.effect == e))
-            present = self._present(swept, present)
-            u = self._moved(u, precision, swept)
+            each = [self._errors(c, u) for c in range(len(self.known_size))]
+            errors, variance = (np.stack(part, 1) for part in zip(*each, strict=True))
+            normal = self._normal(errors, variance)
+            present = self._present(normal, present)
+            u = self._moved(u, normal.given(p.free(present)))
             if sweep >= own.burnt:
-                chosen, variances = zip(*errors, strict=True)
-                sizes = np.sqrt(np.stack(variances, 1))
-                kept.append((u.copy(), present.copy(), np.stack(chosen, 1), sizes))
+                kept.append((u.copy(), present.copy(), errors, np.sqrt(variance)))
         return Draws(*(np.concatenate(part) for part in zip(*kept, strict=True)))
+
+    def _normal(self, errors: NDArray[np.intp], variance: Array) -> _Normal:
+        """Return the Gaussians of u without bounds, with all effects there."""
+        p, grams = self.unknowns, self.grams.gram
+        ridge = np.diag(p.precision + self.settings.flat / (p.high - p.low) ** 2)
+        grams = grams[errors, np.arange(errors.shape[1])] / variance[..., None, None]
+        total = grams.sum(1)
+        linear = p.precision * p.center - total[:, 1:, 0]
+        every = np.ones(linear.shape, dtype=bool)
+        return _Normal(total[:, 1:, 1:] + ridge, linear, p, every)
 
     @cached_property
     def _log_prior(self) -> Array:
@@ -164,45 +164,42 @@ class Sampler:
         (h,) = drawn(log_p - 0.5 * (square / every + count * np.log(every)), rng)
         return h, every[h]
 
-    def _present(self, swept: _Swept, present: Flags) -> Flags:
+    def _present(self, normal: _Normal, present: Flags) -> Flags:
         """Return the effects that are there, one after the other given all others.
 
         Args:
-            swept: Gaussians given the effects that are there; changed in place.
+            normal: Gaussians of u.
             present: Mask of the effects that are there so far, shape (n, e).
         """
         p, present, absent = self.unknowns, present.copy(), self.settings.absent
         log_odds = np.log(absent ** (-1 / max(p.num_effects, 1)) - 1) + p.log_density
-        log_z = swept.log_evidence(p)
+        log_z = normal.given(p.free(present)).log_evidence
         for e in self.rng.permutation(p.num_effects):
-            other = swept.turned(np.flatnonzero(p.effect == e))
-            log_other = other.log_evidence(p)
-            gain = log_other - log_z + np.where(present[:, e], -1, 1) * log_odds[e]
+            other = present.copy()
+            other[:, e] ^= True
+            log_other = normal.given(p.free(other)).log_evidence
+            gain = log_other - log_z + np.where(other[:, e], 1, -1) * log_odds[e]
             flip = self.rng.logistic(size=len(gain)) < gain
             present[:, e] ^= flip
             log_z = np.where(flip, log_other, log_z)
-            swept[flip] = other[flip]
         return present
 
-    def _moved(self, u: Array, precision: Array, swept: _Swept) -> Array:
+    def _moved(self, u: Array, normal: _Normal) -> Array:
         """Return u drawn within its bounds.
 
         As if there were none, where that is within them; else along the eigenvectors of
         its precision. The first is exact, and whether it is chosen depends on no
         earlier u.
         """
-        p, rng, free = self.unknowns, self.rng, swept.free
-        mean = np.where(free, swept.table[:, :-1, -1], 0.0)
-        full = np.where(free[:, :, None] & free[:, None], precision, np.eye(len(p.low)))
-        upper = np.swapaxes(np.linalg.cholesky(full), 1, 2)
+        p, rng, free, mean = self.unknowns, self.rng, normal.free, normal.mean
+        upper = np.swapaxes(np.linalg.cholesky(normal.precision), 1, 2)
         new = np.linalg.solve(upper, rng.standard_normal((*u.shape, 1)))[..., 0]
         new = np.where(free, mean + new, 0.0)
         out = np.flatnonzero(((new < p.low) | (new > p.high)).any(1))
         if not len(out):
             return new
         u, mean, free = np.where(free, u, 0.0)[out], mean[out], free[out]
-        values, vectors = eigh(full[out])
-        sd = 1 / np.sqrt(values)
+        values, vectors = eigh(normal.precision[out])
         for j in range(u.shape[1]):
             is_along = free & (np.abs(vectors[:, :, j]) > 1e-12)
             e = np.where(is_along, vectors[:, :, j], 0.0)
@@ -212,62 +209,52 @@ class Sampler:
             low = np.minimum(ends.min(0).max(1), 0.0)
             high = np.maximum(ends.max(0).min(1), 0.0)
             off = (e * (mean - u)).sum(1)  # along it u is independent of all others
-            step = truncated_normal(off, sd[:, j], low, high, rng)
+            step = truncated_normal(off, values[:, j] ** -0.5, low, high, rng)
             moved = u + np.where(e.any(1), step, 0.0)[:, None] * e
             u = np.clip(moved, p.low, p.high)
         new[out] = np.where(free, u, 0.0)
         return new
 
 
-class _Swept:
-    r"""Gaussians of u without bounds, given what is free of it, by the sweep operator.
+@dataclass(frozen=True)
+class _Normal:
+    """Gaussians of u, n of them, without bounds.
 
     Attributes:
-        table: Minus the covariance of what is free, its mean in the last column, and
-            in the corner :math:`-b^T P^{-1} b`; shape (n, d + 1, d + 1).
-        log_det: Log determinant of the precision of what is free, shape (n,).
-        free: Shape (n, d).
+        precision: Precision of what is free, and one of what is zero, (n, d, d).
+        linear: Precision times mean, shape (n, d).
+        unknowns: Bounds, within which u has its evidence.
+        free: Coordinates that are not zero, shape (n, d).
     """
 
-    def __init__(self, precision: Array, linear: Array) -> None:
-        table = np.concatenate([precision, linear[:, None]], 1)
-        right = np.concatenate([linear, np.zeros((len(linear), 1))], 1)
-        self.table = np.concatenate([table, right[:, :, None]], 2)
-        self.log_det = np.zeros(len(linear))
-        self.free = np.zeros(linear.shape, dtype=bool)
+    precision: Array
+    linear: Array
+    unknowns: Unknowns
+    free: Flags
 
-    def __getitem__(self, rows: Any) -> _Swept:
-        new = copy(self)
-        new.table, new.free = self.table[rows].copy(), self.free[rows].copy()
-        new.log_det = self.log_det[rows].copy()
-        return new
+    def given(self, free: Flags) -> _Normal:
+        """Return them with some coordinates alone, the others being zero."""
+        eye, both = np.eye(free.shape[1]), free[:, :, None] & free[:, None]
+        precision = np.where(both, self.precision, eye)
+        return _Normal(precision, np.where(free, self.linear, 0.0), self.unknowns, free)
 
-    def __setitem__(self, rows: Any, other: _Swept) -> None:
-        self.table[rows], self.free[rows] = other.table, other.free
-        self.log_det[rows] = other.log_det
+    @cached_property
+    def cov(self) -> Array:
+        """Covariances, shape (n, d, d)."""
+        return np.linalg.inv(self.precision)
 
-    def turned(self, places: NDArray[np.intp]) -> _Swept:
-        """Return those where some coordinates are free that were not, or vice versa."""
-        new = self[:]
-        for k in places:
-            row = new.table[:, k].copy()
-            pivot = row[:, [k]]
-            over = row / pivot
-            new.table -= over[:, :, None] * row[:, None]
-            over = np.where(new.free[:, [k]], -over, over)
-            new.table[:, k], new.table[:, :, k] = over, over
-            new.table[:, k, k] = -1 / pivot[:, 0]
-            new.log_det += np.log(np.abs(pivot[:, 0]))
-            new.free[:, k] = ~new.free[:, k]
-        return new
+    @property
+    def mean(self) -> Array:
+        """Means, shape (n, d)."""
+        return (self.cov @ self.linear[..., None])[..., 0]
 
-    def log_evidence(self, p: Unknowns) -> Array:
-        """Return the log evidence of what is free, up to what all share, (n,)."""
+    @property
+    def log_evidence(self) -> Array:
+        """Log evidence of what is free, up to what all share, (n,)."""
+        p, mean = self.unknowns, self.mean
         some = np.isfinite(p.low) | np.isfinite(p.high)
-        free = self.free[:, some]
-        variance = -np.einsum("nii->ni", self.table)[:, :-1][:, some]
-        sd = np.sqrt(np.where(free, variance, 1.0))
-        mean = np.where(free, self.table[:, :-1, -1][:, some], 0.0)
-        inside = log_inside(mean, sd, p.low[some], p.high[some])
-        log_z = np.where(free, inside, 0.0).sum(1)
-        return log_z - 0.5 * (self.table[:, -1, -1] + self.log_det)
+        sd = np.sqrt(np.einsum("nii->ni", self.cov)[:, some])
+        inside = log_inside(mean[:, some], sd, p.low[some], p.high[some])
+        log_z = np.where(self.free[:, some], inside, 0.0).sum(1)
+        log_det = np.linalg.slogdet(self.precision)[1]
+        return log_z + 0.5 * ((self.linear * mean).sum(1) - log_det)

@@ -39,7 +39,7 @@ from sbi_active.criticism.linear.processes import (
 )
 from sbi_active.criticism.results import OUTLIER, UNEXPLAINED
 from sbi_active.criticism.rivals.error_models import LOG_2PI, NoiseGrid
-from sbi_active.criticism.steps.nuisances import is_first_part
+from sbi_active.criticism.steps.predictive import is_first_part
 from sbi_active.inference.sampling.weights import log_sum_exp
 
 #: Sizes of the process in sensor deviations, a factor apart.

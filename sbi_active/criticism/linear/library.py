@@ -8,7 +8,6 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from sbi_active.arrays import Array
 from sbi_active.criticism.linear.errors import Errors
 from sbi_active.criticism.linear.mixture import Mixture, either
 from sbi_active.criticism.linear.model import LinearModel
@@ -66,14 +65,6 @@ class Library:
         """Return the log posterior probability of a set, unnormalized."""
         every = (*self.base.effects, *names)
         return either(*self._posterior(names)) + log_prior(every, self.prior)
-
-    def optimum(self, name: str) -> tuple[ModelKey, Array]:
-        """Return the key of a model with one effect, and its linear optimum, (d,)."""
-        model, own = self.columns[name]
-        mean, u = self._posterior((name,))[1].mean, np.where(own, model.u, 0.0)
-        u[~own] += mean[: len(self._own)]
-        u[own] += mean[len(self._own) :]
-        return model.key, np.clip(u, model.low, model.high)
 
     def _at(self, names: Sequence[str]) -> NDArray[np.intp]:
         return np.concatenate([self._own, *[self._places[name] for name in names]])

@@ -284,7 +284,7 @@ def with_prior(rival: Rival, u: Array, residual: Array, jacobian: Array) -> Line
     scaled = np.zeros(rival.dim, dtype=bool)
     precision = np.where(c.precision > 0, c.precision, 0.3)
     names = {e.name for e in rival.effects}
-    for name, place in rival.columns().items():
+    for name, place in c.places.items():
         if name in names:
             scaled[place] = ~bounded[place]
             # Between bounds a phi is as likely anywhere: its own variance is one.
@@ -377,7 +377,8 @@ def at_null(rival: Rival, effect: Effect, tried: float) -> tuple[Array, Array]:
         effect: The effect.
         tried: Length of the step.
     """
-    c, place = rival.coordinates, rival.columns()[effect.name]
+    c = rival.coordinates
+    place = c.places[effect.name]
     z = c.to_z(np.clip(np.zeros((1, rival.dim)), c.low, c.high))
     # Where no number makes it vanish, the end of the prior that is nearest to it.
     z[:, place] = effect.null_phi(1, finite=True).double().numpy()

@@ -10,7 +10,7 @@ beside one of the best single effects, and larger sets grown from the best small
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import combinations
 
 import numpy as np
@@ -22,6 +22,7 @@ from sbi_active.criticism.forces.library import is_force
 from sbi_active.criticism.linear.errors import Errors
 from sbi_active.criticism.linear.fits import (
     FitSettings,
+    Sensor,
     along_secants,
     best_fit,
     onward,
@@ -36,7 +37,6 @@ from sbi_active.criticism.linear.model import (
     enlarged,
     has_null,
 )
-from sbi_active.criticism.linear.sensor import Sensor
 from sbi_active.criticism.results import ModelKey
 from sbi_active.criticism.rivals.residual_process import ResidualProcess
 from sbi_active.criticism.rivals.rival import Rival
@@ -105,13 +105,10 @@ class Search:
         if self._looked_again:
             return False
         self._looked_again = True
-        key, settings = ModelKey(), self.settings
-        found, own = self.rivals.search(key), self.rival(key)
-        best = min(
-            (self._polished(own, u) for u in found.modes[: settings.num_kept]),
-            key=lambda fit: fit.cost,
-        )
-        fall = self.found[key].model.cost - best.cost
+        settings, given = self.settings, (self.rivals.prior_draws, self.units)
+        most = {"num_starts": settings.starts_again, "num_kept": settings.kept_again}
+        best = best_fit(self.rival(ModelKey()), *given, replace(settings, **most))
+        fall = self.found[ModelKey()].model.cost - best.cost
         if fall < settings.worth * max(best.rms, 1.0) ** 2:
             return False
         self._begin(best)
@@ -191,7 +188,7 @@ class Search:
             new = [
                 c.log_p_either for k, c in self.found.items() if len(k.effects) == size
             ]
-            if max(new, default=-np.inf) < before:
+            if not new or max(new) < before:
                 break
             before = max(new)
 
@@ -237,7 +234,7 @@ class Search:
         rival = self.rival(key)
         keep = np.ones(rival.dim, dtype=bool)
         for name in {*key.effects} - {*part.effects}:
-            keep[rival.columns()[name]] = False
+            keep[rival.coordinates.places[name]] = False
         return keep
 
     def column(
@@ -255,11 +252,6 @@ class Search:
         start[~own], start[own] = model.u, null
         slope = chords(rival, start, own, step, model, self.units)
         return enlarged(model, rival, own, null, slope), own
-
-    def rms(self, key: ModelKey, u: Array) -> float:
-        """Return the rms residual of a model anywhere, in sensor deviations."""
-        r = self.rival(key).residual(u[None])[0] / self.units
-        return float(np.sqrt(np.mean(r[:, : len(self.unit)] ** 2)))
 
     def _best(self, size: int) -> list[ModelKey]:
         """Return the sets to add to: the likeliest by either error, the best fits.
@@ -378,7 +370,7 @@ class Search:
         effect as strong as its prior holds the machine still, or throws it about.
         """
         rival, model = self.rival(key), self.found[parent].model
-        u, columns = np.empty(rival.dim), rival.columns()
+        u, columns = np.empty(rival.dim), rival.coordinates.places
         u[self.columns(key, parent)] = model.u
         for name in {*key.effects} - {*parent.effects}:
             null, step = self._at_null(name)

@@ -1,27 +1,33 @@
-"""What speaks against a verdict's effects, and models that the trials refute."""
+"""What speaks against a verdict: further trials, and a prior that is too narrow."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.stats import chi2
 
 from sbi_active.arrays import Array
+from sbi_active.criticism.contradictions import BoundParameter, Bounds
+from sbi_active.criticism.evidence.fit import Fit
+from sbi_active.criticism.evidence.rival_set import RivalSet
+from sbi_active.criticism.forces.library import is_force
 from sbi_active.criticism.results import (
     CATCH_ALLS,
     NONE,
     OUTLIER,
     UNEXPLAINED,
-    Estimate,
     Evaluation,
-    Evidence,
     ModelKey,
     Tracing,
 )
-from sbi_active.criticism.steps.detection import THRESHOLD
+from sbi_active.criticism.rivals.error_models import Whitener
+from sbi_active.criticism.rivals.rival import Rival
+from sbi_active.criticism.steps.detection import LEVEL, THRESHOLD
 from sbi_active.criticism.under_misfit import Misfit
+from sbi_active.inference.sampling.least_squares import descend
 from sbi_active.seeding import derive_seed
 
 #: Score of trials that speaks against effects.
@@ -135,9 +141,7 @@ def withdrawn(tracing: Tracing) -> Tracing:
     )
 
 
-def widened(
-    tracing: Tracing, seed: int, within: Callable[[ModelKey, Array], Array]
-) -> Tracing:
+def widened(tracing: Tracing, rivals: RivalSet) -> Tracing:
     r"""Return a verdict whose refuted models have draws that know of it.
 
     The posterior of a model that misses the trials is as narrow as the sensor allows,
@@ -148,8 +152,7 @@ def widened(
 
     Args:
         tracing: Tracing with effects as the verdict.
-        seed: Seed of the draws.
-        within: Moves draws of a model, shape (n, k), into the bounds of its prior.
+        rivals: The models, for bounds of priors.
 
     References:
         Birge, Physical Review 40 (1932), for the ratio.
@@ -158,28 +161,216 @@ def widened(
     if not tracing.chosen or best is None:
         return tracing
     found = dict(tracing.evidences)
-    for name, own in found.items():
+    known = dict(zip(best.names, best.draws.mean(0), strict=True))
+    for name, own in tracing.evidences.items():
         near = own.log_evidence > best.log_evidence - THRESHOLD
         if near or own.key.error is not None:
             continue
-        draws = _widened(own, best, derive_seed(seed, "refuted", name))
-        draws = within(own.key, draws)
+        ratio = max(own.best_chi_square / max(best.best_chi_square, 1.0), 1.0)
+        mean = own.draws.mean(0)
+        center = [known.get(n, m) for n, m in zip(own.names, mean, strict=True)]
+        rng = np.random.default_rng(derive_seed(rivals.seed, "refuted", name))
+        moved = rng.normal(size=(len(own.draws), 1)) * (np.array(center) - mean)
+        draws = mean + np.sqrt(ratio) * (own.draws - mean) + moved
+        draws = rivals.rival(own.key).coordinates.within(draws)
         found[name] = replace(own, draws=draws, narrow=own.draws)
-    estimates = [_estimate(e, found[e.name].draws) for e in tracing.estimates]
+    estimates = []
+    for one in tracing.estimates:
+        phi = found[one.name].draws[:, -len(one.mean) :]
+        estimates.append(replace(one, mean=phi.mean(0), sd=phi.std(0)))
     return replace(tracing, evidences=found, estimates=(*estimates,))
 
 
-def _estimate(estimate: Estimate, draws: Array) -> Estimate:
-    """Return an effect's estimate by the draws of the model that has it alone."""
-    phi = draws[:, -len(estimate.mean) :]
-    return replace(estimate, mean=phi.mean(0), sd=phi.std(0))
+#: Draws of a posterior that say whether it lies at a bound, and steps of a refit.
+NUM_DRAWS, STEPS = 400, 30
 
 
-def _widened(own: Evidence, best: Evidence, seed: int) -> Array:
-    ratio = own.best_chi_square / max(best.best_chi_square, 1.0)
-    mean = own.draws.mean(0)
-    known = dict(zip(best.names, best.draws.mean(0), strict=True))
-    apart = np.array([known.get(n, m) for n, m in zip(own.names, mean, strict=True)])
-    normal = np.random.default_rng(seed).normal(size=(len(own.draws), 1))
-    spread = np.sqrt(max(ratio, 1.0)) * (own.draws - mean)
-    return mean + spread + normal * (apart - mean)
+def judged(
+    rivals: RivalSet, tracing: Tracing, evaluation: Evaluation | None
+) -> Tracing:
+    """Return the tracing, and whether its forces are stand-ins.
+
+    A force is adopted as an explanation only if the chi-square of its model has a tail
+    probability of at least .01, and the error on trials that were not used falls. A
+    force with which that error rises is withdrawn, and so are effects that a wider
+    prior makes up for.
+
+    Args:
+        rivals: The models.
+        tracing: Tracing with the effects that the data point to.
+        evaluation: Error before and after on trials that had no part in it.
+    """
+    tracing = beyond_bounds(rivals, unless_refuted(tracing, evaluation))
+    effects = {e.name: e for e in rivals.library}
+    if not any(is_force(effects[name]) for name in tracing.chosen):
+        return tracing
+    if evaluation is not None:
+        rmse = evaluation.table.set_index("metric").to_dict("index")["rmse"]
+        if rmse["ratio"] >= 1:
+            return replace(withdrawn(tracing), refuted=(rmse["before"], rmse["after"]))
+    return replace(tracing, stand_in=(*_reasons(rivals, tracing, evaluation),))
+
+
+def _reasons(
+    rivals: RivalSet, tracing: Tracing, evaluation: Evaluation | None
+) -> Iterator[str]:
+    if tracing.p_value < LEVEL:
+        yield f"its chi-square has p = {tracing.p_value:.2g}"
+    if evaluation is not None and evaluation.p_value < LEVEL:
+        yield f"that of held-out trials has p = {evaluation.p_value:.2g}"
+    if any(name.startswith("free") for name in tracing.chosen):
+        yield "its form is free"
+    families = [e.family for e in rivals.library if e.name in tracing.chosen]
+    if len({*families}) < len(families):
+        yield "it takes several forms of one family"
+    if tracing.log_process > 1.1:  # it does not explain all
+        yield f"a residual process beside it gains {tracing.log_process:.1f} nats"
+
+
+def beyond_bounds(rivals: RivalSet, tracing: Tracing) -> Tracing:
+    """Return the tracing with the parameters at bounds, and fits with a wider prior.
+
+    Parameters of the bare model and of the verdict's model that lie at a bound are
+    fitted again with the bound moved. If the bare model then explains the trials as
+    well as the effects of the verdict, which have no Bayes factor of 20 left against
+    it, these cannot be told from a prior that is too narrow, and are not named. Neither
+    are effects that no permitted action separates from the bare model, whatever its
+    prior is.
+
+    Args:
+        rivals: The models.
+        tracing: Tracing with the effects that the data point to.
+    """
+    keys = [k for k in dict.fromkeys([ModelKey(), tracing.key]) if k in rivals.fits]
+    fits = [rivals.fits[key] for key in keys]
+    sides = [_sides(fit, derive_seed(rivals.seed, "bounds")) for fit in fits]
+    if not any(side.any() for side in sides):
+        return _unless_none(tracing, Bounds())
+    start, own = fits[-1].point, rivals.rival(ModelKey(keys[-1].effects))
+    whiten = rivals.noise.whitener(own.residual(start[None])[0][0])
+    u = _best(rivals, own, whiten, start[None])
+    assert u is not None
+    square = float((whiten(own.residual(u[None])[0][0]) ** 2).sum())
+    dim, bounds = rivals.prior.event_shape[0], Bounds()
+    for key, fit, side in zip(keys, fits, sides, strict=True):
+        if not side.any():
+            continue
+        rival = _moved(rivals.rival(key), side)
+        starts = np.stack([fit.point, np.r_[start[:dim], fit.point[dim:]]])
+        u = _best(rivals, rival, whiten, starts)
+        held = _held(rivals, fit, side, rival, u)
+        bounds = replace(bounds, parameters=(*bounds.parameters, *held))
+        if key != ModelKey() or u is None or not held:
+            continue
+        rest = rival.residual(u[None])[0][0]
+        spare = max(len(rest) - rival.dim, 1)
+        more = float((whiten(rest) ** 2).sum()) - square
+        bounds = replace(bounds, p_value=_tail(rivals, tracing, rest, whiten, spare))
+        if tracing.chosen and more < 2 * THRESHOLD * max(square / spare, 1.0):
+            bounds = replace(bounds, replaces=str(ModelKey(tracing.chosen)))
+    return _unless_none(tracing, bounds)
+
+
+def _unless_none(tracing: Tracing, bounds: Bounds) -> Tracing:
+    """Return the tracing without effects that are the bare model's parameters."""
+    as_none = frozenset().union(*[g for g in tracing.equivalent if NONE in g])
+    if tracing.chosen and as_none.issuperset(tracing.chosen):
+        bounds = replace(bounds, replaces=str(ModelKey(tracing.chosen)))
+    if bounds.replaces:
+        tracing = replace(withdrawn(tracing), verdict=UNEXPLAINED)
+    return replace(tracing, bounds=bounds)
+
+
+def _sides(fit: Fit, seed: int) -> NDArray[np.int64]:
+    """Return at which bound each of theta and phi is in a model, (d,): -1, 1 or 0."""
+    c = fit.rival.coordinates
+    own = c.num_own
+    if fit.best is None:
+        u = fit.sample.draws(NUM_DRAWS, np.random.default_rng(seed))
+    else:  # where draws are as wide as misfit asks, some reach any bound
+        u = fit.best[None]
+    side = c.sides(u[:, :own])
+    # An effect that vanishes at a bound is a weak one, and no prior is too narrow.
+    z, null = c.to_z(c.center[None])[0], np.zeros(own, dtype=bool)
+    for effect in fit.rival.effects:
+        place = c.places[effect.name]
+        z[place], null[place] = effect.null_phi(1).double().numpy()[0], True
+    ends = np.where(side < 0, c.low[:own], c.high[:own])
+    side[null & (np.abs(c.from_z(z[None])[0, :own] - ends) < 1e-6)] = 0
+    return side
+
+
+def _moved(rival: Rival, side: NDArray[np.int64]) -> Rival:
+    """Return a rival with some of its bounds moved by the width of the prior.
+
+    Half of that still reaches what a prior barely excludes, twice asks too much of the
+    simulator. A positive parameter keeps its sign and a tenth of its bound, since a
+    simulator may not know what a negative friction is.
+    """
+    c = rival.coordinates
+    zero, width = -c.shift / c.scale, c.high - c.low
+    c.low, c.high = c.low.copy(), c.high.copy()
+    for k in np.flatnonzero(side):
+        end = c.low if side[k] < 0 else c.high
+        bound, farthest = end[k], end[k] + side[k] * width[k]
+        is_signed = not c.is_log[k] and side[k] * (zero[k] - bound) > 0
+        last = zero[k] + 0.1 * (bound - zero[k])
+        end[k] = side[k] * min(side[k] * farthest, side[k] * last)
+        end[k] = end[k] if is_signed else farthest
+    return rival
+
+
+def _best(
+    rivals: RivalSet, rival: Rival, whiten: Whitener, starts: Array
+) -> Array | None:
+    """Return the best fit of a rival, (d,); None if the simulator has none."""
+    if not rivals.is_smooth:
+        return starts[0]
+    try:
+        u, cost = descend(rival, starts, whiten, rivals.step, STEPS)
+    except (ArithmeticError, RuntimeError, ValueError):
+        return None  # a simulator may refuse what its prior excludes
+    return u[int(np.argmin(cost))]
+
+
+def _tail(
+    rivals: RivalSet, tracing: Tracing, rest: Array, whiten: Whitener, spare: int
+) -> float:
+    """Return the tail probability of a chi-square; NaN where errors have no size."""
+    misfit, noise = tracing.misfit, rivals.model.noise
+    if misfit is not None:
+        unit = misfit.sensor[rivals.measurements.channel]
+        return float(chi2.sf(((rest / unit) ** 2).sum(), spare))
+    if noise is None or noise.posterior is not None or len(rivals.noise.scales) > 1:
+        return float("nan")
+    return float(chi2.sf((whiten(rest) ** 2).sum(), spare))
+
+
+def _held(
+    rivals: RivalSet, fit: Fit, side: NDArray[np.int64], rival: Rival, u: Array | None
+) -> list[BoundParameter]:
+    """Return the parameters of a model at bounds, and where they are beyond them.
+
+    One that stays inside though its bound was moved is not held by it.
+    """
+    c = fit.rival.coordinates
+    z = np.full(c.dim, np.nan) if u is None else rival.coordinates.to_z(u[None])[0]
+    names = rivals.names_of(rival)
+    found = []
+    for k in np.flatnonzero(side).tolist():
+        ends = np.where(side[k] < 0, c.low, c.high)
+        bound = c.to_z(np.where(np.isfinite(ends), ends, 0.0)[None])[0, k]
+        # Without a derivative nothing was fitted again.
+        beyond = z[k] if rivals.is_smooth else np.nan
+        if side[k] * (beyond - bound) <= 0:
+            continue
+        found.append(
+            BoundParameter(
+                name=names[k],
+                model=str(ModelKey(rival.key.effects)),
+                side="lower" if side[k] < 0 else "upper",
+                bound=float(bound),
+                beyond=float(beyond),
+            )
+        )
+    return found

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -129,13 +131,10 @@ def _linear(
     model = search.model(states.predicting(key))
     seed = derive_seed(models.seed, "linear", str(model.key))
     best, mode, square = None, model.u, model.chi_square[0]
-    unit: Array | None = None
+    linear: Callable[[Array], Array] | None = None
 
     def drawn(center: Array, cov: Array) -> Array:
         return model.draws(center, cov, NUM_DRAWS, np.random.default_rng(seed))
-
-    def linear(u: Array) -> Array:
-        return unit * model.at(u)[:, : model.num]
 
     if found.is_missed:
         log_z, best = search.found[key].beside.log_evidence, model.u
@@ -143,16 +142,16 @@ def _linear(
             best = refitted(search.rival(key), model, search.units, known)
         u = drawn(best, found.covariance(key))
     else:
-        own = at = states.mixture(key, use)
+        at = states.mixture(key, use)
+        log_z = at.log_evidence
         if key.effects and found.key == ModelKey(key.effects, OUTLIER):
             at = states.mixture(found.key, use)
         if use is not None and np.isfinite(search.sensor.df):
             model, at = by_weights(model, search, use)
-        log_z, u = own.log_evidence, drawn(at.mean, at.cov)
-        unit = search.unit * model.scale
+        u, linear = drawn(at.mean, at.cov), partial(_residual, search.unit, model)
         if states.louder(key):
             phi, square = states.louder_draws(key, use)[0], states.chi_square(key)[0]
-            u, mode, unit = _with_louder(rival, u, phi), None, None
+            u, mode, linear = _with_louder(rival, u, phi), None, None
     sample = WeightedDraws(
         u=u,
         weight=np.full(NUM_DRAWS, 1 / NUM_DRAWS),
@@ -163,12 +162,13 @@ def _linear(
     )
     if found.is_missed and use is None:
         u = drawn(model.u, found.shown(key))
-    evidence = models.record(rival, sample, u, square)
-    if best is not None:
-        z = rival.coordinates.to_z(best[None])[0, : evidence.draws.shape[1]]
-        evidence = replace(evidence, best=z)
-    weighs = None if unit is None else linear
-    return Fit(rival, sample, evidence, best, mode, weighs, known)
+    evidence = models.record(rival, sample, u, square, best)
+    return Fit(rival, sample, evidence, best, mode, linear, known)
+
+
+def _residual(unit: Array, model: LinearModel, u: Array) -> Array:
+    """Return residuals of a linear model, (n, N), of coordinates (n, d)."""
+    return unit * model.scale * model.at(u)[:, : model.num]
 
 
 def _with_louder(rival: Rival, u: Array, phi: Array) -> Array:

@@ -53,22 +53,13 @@ def evaluate_held_out(
     if tracing.verdict != NONE:
         after = predict(rivals, held_out, key=tracing.key, num_draws=num_draws)
     num = len(held_out)
-    found = summary(
-        "held out",
-        np.arange(num),
-        scores(before),
-        scores(after),
-        (tracing.verdict,) * num,
-        held_out.names,
-    )
+    scored, selected = (scores(before), scores(after)), (tracing.verdict,) * num
+    found = summary("held out", np.arange(num), *scored, selected, held_out.names)
     missed = missed_trials(rivals, tracing, held_out, before, after, level=level)
-    found = replace(found, missed=missed)
-    if (
-        not isinstance(rivals.model.noise, GaussianNoise)
-        or len(rivals.noise.scales) > 1
-    ):
-        return found  # errors have no declared size
-    return replace(found, p_value=tail(after))
+    has_size = len(rivals.noise.scales) == 1
+    if has_size and isinstance(rivals.model.noise, GaussianNoise):
+        found = replace(found, p_value=tail(after))
+    return replace(found, missed=missed)
 
 
 def evaluate_left_out(

@@ -57,6 +57,9 @@ REMAINS = 0.75
 def guess_residual(search: Search) -> tuple[tuple[str, float], ...]:
     """Return formulas that the bare model's residual follows, best first.
 
+    Of numbers without a time axis, the simplest of those that the best does not beat by
+    the margin comes before it.
+
     Args:
         search: The models, with the bare one.
 
@@ -64,40 +67,33 @@ def guess_residual(search: Search) -> tuple[tuple[str, float], ...]:
         Formulas and their log evidence above that of the bare model with its process,
         nats; empty if there is none.
     """
-    if not search.rivals.measurements.is_sequence:
-        return _guess_of_numbers(search)
-    bare = search.found[ModelKey()]
-    terms = [*_terms(search)]
-    least = 1 - (1 - 0.9) / max(len(terms), 1)  # all that were tried count
-    excess = max(bare.left.mean_square - 1, 1e-2)
-    found = []
+    timed, bare = search.rivals.measurements.is_sequence, search.found[ModelKey()]
+    least = bare.beside.log_evidence
+    if not timed:
+        every = np.ones(search.errors.num_folds, dtype=bool)
+        least = summed(*search.smooth(bare.model, every), bare.model).log_evidence
+    terms, gains = [*_terms(search, of_all=not timed)], {}
     for name, term in terms:
         model = _with_term(bare.model, term / search.unit)
-        left = leave_out(model, search.errors)
-        if predicts_better(left.square, bare.left.square) < least:
+        if timed and not _predicts(search, model, len(terms)):
             continue
-        remains = (left.mean_square - 1) / excess
-        gain = _log_evidence(search, model) - bare.beside.log_evidence
-        if remains <= REMAINS and gain > MARGIN:
-            found.append((name, float(gain)))
-    return (*sorted(found, key=lambda each: -each[1]),)
+        gain = float(_log_evidence(search, model, beside=timed) - least)
+        if gain > MARGIN:
+            gains[name] = gain
+    best = sorted(gains, key=lambda name: -gains[name])
+    if not timed:
+        alike = [n for n in gains if gains[n] > gains[best[0]] - MARGIN]
+        best = [*dict.fromkeys([*alike[:1], *best])]
+    return tuple((name, gains[name]) for name in best)
 
 
-def _guess_of_numbers(search: Search) -> tuple[tuple[str, float], ...]:
-    """Return formulas above the residual process, the best first.
-
-    The simplest of those that it does not beat by the margin comes before it.
-    """
-    bare, errors, gains = search.found[ModelKey()].model, search.errors, {}
-    every = np.ones(errors.num_folds, dtype=bool)
-    least = summed(*search.smooth(bare, every), bare).log_evidence
-    for name, term in _terms(search, of_all=True):
-        model = _with_term(bare, term / search.unit)
-        gains[name] = _log_evidence(search, model, beside=False)
-    gains = {n: float(g - least) for n, g in gains.items() if g - least > MARGIN}
-    best = sorted(gains, key=gains.__getitem__)[::-1]
-    alike = [n for n in gains if gains[n] > gains[best[0]] - MARGIN]
-    return tuple((n, gains[n]) for n in dict.fromkeys([*alike[:1], *best]))
+def _predicts(search: Search, model: LinearModel, tried: int) -> bool:
+    """Return whether a guess predicts left-out trials, beside all that were tried."""
+    bare, left = search.found[ModelKey()].left, leave_out(model, search.errors)
+    sure = 1 - (1 - 0.9) / tried
+    excess = max(bare.mean_square - 1, 1e-2)
+    enough = predicts_better(left.square, bare.square) >= sure
+    return enough and (left.mean_square - 1) / excess <= REMAINS
 
 
 def gained_by_guesses(search: Search, key: ModelKey, name: str) -> float:
@@ -112,10 +108,10 @@ def gained_by_guesses(search: Search, key: ModelKey, name: str) -> float:
         name: Name of the effect.
     """
     without = search.found[key.without(name)].model
-    m = search.rivals.measurements
+    every = np.ones(len(search.rivals.measurements), dtype=bool)
     found = [
         _log_evidence(search, _with_term(without, term / search.unit))
-        for _, term in _distinct(search, np.ones(len(m), dtype=bool), "", [])
+        for _, term in _distinct(search, every, "", [])
     ]
     mean = log_sum_exp(np.array(found)) - np.log(len(found))
     return float(mean - search.found[key].beside.log_evidence)

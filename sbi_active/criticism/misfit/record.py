@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from itertools import combinations
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
-from sbi_active.actions import ActionSpace
 from sbi_active.arrays import Array
 from sbi_active.criticism.data.trials import Trials
 from sbi_active.criticism.evidence.rival_set import RivalSet
-from sbi_active.criticism.linear.search import Search
 from sbi_active.criticism.misfit.contrary import is_left_to_chance, withdrawn
 from sbi_active.criticism.misfit.draws import posterior
 from sbi_active.criticism.misfit.guesses import guess_residual
@@ -25,13 +22,8 @@ from sbi_active.criticism.results import (
     ModelKey,
     Tracing,
 )
-from sbi_active.criticism.rivals.trial_simulator import TrialSimulator
 from sbi_active.criticism.steps.detection import THRESHOLD
-from sbi_active.criticism.steps.equivalence import (
-    equivalent_effects,
-    every_action,
-    noise_unit,
-)
+from sbi_active.criticism.steps.equivalence import equivalent_effects
 from sbi_active.criticism.steps.predictive import predict
 from sbi_active.criticism.steps.tracing import credible_set
 from sbi_active.criticism.under_misfit import Misfit as Found
@@ -43,58 +35,90 @@ SHOWN = 0.01
 
 
 def traced(
-    found: Verdict,
-    held_out: Trials | None,
-    *,
-    actions: ActionSpace | None = None,
-    near: bool = True,
+    found: Verdict, held_out: Trials | None, *, near: bool = True
 ) -> tuple[Tracing, RivalSet]:
     """Return the verdict, and the models behind it with posterior draws.
 
     Args:
         found: The models and what helps.
         held_out: Trials on which the recorded models are scored; None for none.
-        actions: The permitted ones, for what they hardly separate.
         near: Whether to look for groups that these trials do not separate as well.
     """
-    if found.is_missed:
-        return _beside_misfit(found, held_out)
-    rivals, states, key = found.rivals, found.states, found.key
-    is_unexplained = key.error == UNEXPLAINED  # with an error of no declared size
-    chosen = () if is_unexplained else key.effects
-    louder = [k for k in found.probabilities if states.louder(k)]
-    louder = [k for k in louder if found.probabilities[k] >= SHOWN]
-    keys = [*states.keys(ModelKey()), *_shown(found), key, *louder]
-    keys += [ModelKey((name,)) for name in rivals.effects]
-    keys = [k for k in keys if k.error is None or not k.effects]
-    groups = equivalent_effects(rivals, None) if near else ()
-    probabilities = {str(k): p for k, p in found.probabilities.items()}
+    rivals, is_missed = found.rivals, found.is_missed
+    keys, probabilities = _tabled(found) if is_missed else _likely(found)
     models = _with_posteriors(found, keys)
-    common = _common(found, models, probabilities)
-    aliases: tuple[frozenset[str], ...] = ()
-    if found.detection.alarm:
-        singles = {n: common["evidences"][n].log_evidence for n in rivals.effects}
-        known = [*found.equivalent, *groups]
-        aliases = near_aliases(found.search, singles, actions, known)
-    effects, best = ModelKey(key.effects), found.choice.key
-    gain = states.log_evidence(ModelKey(best.effects, UNEXPLAINED))
-    has_size, trials = found.search.sensor.is_known, rivals.trials
+    evidences = {str(key): fit.evidence for key, fit in models.fits.items()}
+    trials = rivals.trials
     tracing = Tracing(
-        verdict=str(ModelKey(chosen) if chosen else ModelKey(error=key.error)),
-        chosen=chosen,
-        near=groups,
-        aliases=aliases,
-        guesses=_guesses(found) if is_unexplained else (),
-        beside=key.effects if is_unexplained else (),
-        outliers=found.outliers,
-        needed=states.needed(effects, THRESHOLD) if chosen else (),
-        p_value=states.chi_square(effects)[1] if has_size else float("nan"),
-        log_process=gain - states.log_evidence(best),
+        probabilities=probabilities,
+        inclusion=found.inclusion,
+        credible_set=credible_set(probabilities),
+        equivalent=(*found.equivalent,),
+        near=equivalent_effects(rivals, None) if near and not is_missed else (),
+        estimates=_estimates(found, evidences),
+        evidences=evidences,
+        robust=found.is_robust(),
         trial_names=dict(zip(trials.index.tolist(), trials.names, strict=True)),
-        **common,
+        **(_missing(found, models, held_out) if is_missed else _explaining(found)),
     )
-    is_withdrawn = is_left_to_chance(tracing)
+    is_withdrawn = not is_missed and is_left_to_chance(tracing)
     return withdrawn(tracing) if is_withdrawn else tracing, models
+
+
+def _likely(found: Verdict) -> tuple[list[ModelKey], dict[str, float]]:
+    """Return the models that are recorded if one explains, and probabilities."""
+    p, states = found.probabilities, found.states
+    louder = [key for key in p if states.louder(key) and p[key] >= SHOWN]
+    keys = [*states.keys(ModelKey()), *_shown(found), found.key, *louder]
+    keys += [ModelKey((name,)) for name in found.rivals.effects]
+    keys = [key for key in keys if key.error is None or not key.effects]
+    return keys, {str(key): value for key, value in p.items()}
+
+
+def _explaining(found: Verdict) -> dict[str, Any]:
+    """Return the part of a tracing that is of models one of which explains."""
+    states, key, best = found.states, found.key, found.choice.key
+    is_unexplained = key.error == UNEXPLAINED  # with an error of no declared size
+    chosen, effects = () if is_unexplained else key.effects, ModelKey(key.effects)
+    has_size = found.search.sensor.is_known
+    gain = states.log_evidence(ModelKey(best.effects, UNEXPLAINED))
+    return {
+        "verdict": str(ModelKey(chosen) if chosen else ModelKey(error=key.error)),
+        "chosen": chosen,
+        "guesses": _guesses(found) if is_unexplained else (),
+        "beside": key.effects if is_unexplained else (),
+        "outliers": found.outliers,
+        "needed": states.needed(effects, THRESHOLD) if chosen else (),
+        "p_value": states.chi_square(effects)[1] if has_size else float("nan"),
+        "log_process": gain - states.log_evidence(best),
+    }
+
+
+def _tabled(found: Verdict) -> tuple[list[ModelKey], dict[str, float]]:
+    """Return the models that are recorded if every one misses, and probabilities."""
+    tabled = [*_shown(found), found.choice.key, ModelKey()]
+    singles = [ModelKey((name,)) for name in found.search.names]
+    p = {key: found.choice.probabilities.get(key, 0.0) for key in [*tabled, *singles]}
+    ordered = sorted(p.items(), key=lambda item: -item[1])
+    return [*tabled, *singles, *_weights(found)], {str(key): v for key, v in ordered}
+
+
+def _missing(
+    found: Verdict, models: RivalSet, held_out: Trials | None
+) -> dict[str, Any]:
+    """Return the part of a tracing that is of models that all miss the trials."""
+    choice, timed = found.choice, found.rivals.measurements.is_sequence
+    named, helps = choice.named, choice.key.effects
+    tabled = dict.fromkeys([*_shown(found), choice.key, ModelKey()])
+    errors = [_scored(found, models, key, held_out) for key in tabled]
+    return {
+        "verdict": str(ModelKey(named)) if named else found.key.error or UNEXPLAINED,
+        "chosen": helps,
+        "guesses": () if (helps if timed else named) else _guesses(found),
+        "beside": tuple(n for n in helps if n not in named),
+        "misfit": _found(found, errors),
+        "p_value": found.model(choice.key).chi_square[2],
+    }
 
 
 def _with_posteriors(found: Verdict, keys: Sequence[ModelKey]) -> RivalSet:
@@ -106,52 +130,6 @@ def _with_posteriors(found: Verdict, keys: Sequence[ModelKey]) -> RivalSet:
     models = models.with_fits({bare: posterior(found, models, bare)})
     fits = {key: posterior(found, models, key) for key in dict.fromkeys(keys)}
     return models.with_fits(fits)
-
-
-def _beside_misfit(
-    misfit: Verdict, held_out: Trials | None
-) -> tuple[Tracing, RivalSet]:
-    """Return the verdict where every model misses, or several effects fit."""
-    search, choice = misfit.search, misfit.choice
-    singles = {name: ModelKey((name,)) for name in search.names}
-    tabled = [*dict.fromkeys([*_shown(misfit), choice.key, ModelKey()])]
-    named, p = choice.named, choice.probabilities
-    probabilities = {str(k): p.get(k, 0.0) for k in tabled}
-    probabilities |= {n: p.get(k, 0.0) for n, k in singles.items()}
-    ordered = dict(sorted(probabilities.items(), key=lambda item: -item[1]))
-    keys = [*tabled, *singles.values(), *_weights(misfit)]
-    models = _with_posteriors(misfit, keys)
-    common = _common(misfit, models, ordered)
-    beside = {n: search.found[k].beside.log_evidence for n, k in singles.items()}
-    timed = misfit.rivals.measurements.is_sequence
-    tracing = Tracing(
-        verdict=str(ModelKey(named)) if named else misfit.key.error or UNEXPLAINED,
-        chosen=choice.key.effects,
-        near=(),
-        aliases=near_aliases(search, beside, None),
-        guesses=() if (choice.key.effects if timed else named) else _guesses(misfit),
-        beside=tuple(n for n in choice.key.effects if n not in named),
-        misfit=_found(misfit, [_scored(misfit, models, k, held_out) for k in tabled]),
-        p_value=misfit.model(choice.key).chi_square[2],
-        **common,
-    )
-    return tracing, models
-
-
-def _common(
-    found: Verdict, models: RivalSet, probabilities: dict[str, float]
-) -> dict[str, Any]:
-    """Return what a tracing has in any case, with records of the models."""
-    evidences = {str(key): fit.evidence for key, fit in models.fits.items()}
-    return {
-        "probabilities": probabilities,
-        "inclusion": found.inclusion,
-        "credible_set": credible_set(probabilities),
-        "equivalent": (*found.equivalent,),
-        "estimates": _estimates(found, evidences),
-        "evidences": evidences,
-        "robust": found.is_robust(),
-    }
 
 
 def _shown(found: Verdict) -> list[ModelKey]:
@@ -266,66 +244,3 @@ def _estimates(found: Verdict, evidences: dict[str, Evidence]) -> tuple[Estimate
         )
         estimates.append(estimate)
     return (*sorted(estimates, key=lambda e: -e.probability),)
-
-
-def near_aliases(
-    search: Search,
-    log_z: Mapping[str, float],
-    actions: ActionSpace | None,
-    known: Sequence[frozenset[str]] = (),
-) -> tuple[frozenset[str], ...]:
-    r"""Return pairs of effects that are nearly the same here.
-
-    Both have an evidence within log 20 of the best effect's, so that neither is worth
-    an alarm against the other, and fitted to the trials their predictions differ
-    over the permitted actions by less than the noise in the root mean square:
-
-    .. math::
-        \tfrac1N \sum_i (m_{a,i} - m_{b,i})^2 / s_i^2 < 1 .
-
-    They are not equivalent: repeated trials, or stronger data, tell them apart.
-
-    Args:
-        search: Search that has fitted each effect alone.
-        log_z: Evidence of each effect alone, nats.
-        actions: The permitted ones; None compares on the trials at hand.
-        known: Groups that are listed already.
-
-    Returns:
-        Pairs, none of them within a known group.
-    """
-    best = max((log_z[name] for name in search.names), default=-np.inf)
-    likely = [name for name in search.names if log_z[name] > best - THRESHOLD]
-    if len(likely) < 2:
-        return ()
-    mean = _predictions(search, likely, actions)
-    found = []
-    for a, b in combinations(likely, 2):
-        gap = mean[a] - mean[b]
-        gap, pair = gap[np.isfinite(gap)], frozenset({a, b})
-        is_close = gap.size > 0 and np.mean(gap**2) < 1
-        if is_close and not any(pair <= group for group in known):
-            found.append(pair)
-    return tuple(found)
-
-
-def _predictions(
-    search: Search, names: Sequence[str], actions: ActionSpace | None
-) -> dict[str, Array]:
-    """Return what each effect predicts at its best fit, in deviations, (N,) each."""
-    models = {name: search.model(ModelKey((name,))) for name in names}
-    if actions is None:
-        return {n: -m.scale * m.residual[: m.num] for n, m in models.items()}
-    rivals = search.rivals
-    trials = every_action(rivals, actions)
-    seed = derive_seed(rivals.seed, "aliases")
-    simulator = TrialSimulator(rivals.simulator.model, trials, seed=seed)
-    unit, found = noise_unit(rivals, simulator), {}
-    for name, model in models.items():
-        coordinates = rivals.rival(model.key).coordinates
-        theta, phi = coordinates.split(model.u[None])
-        for effect in rivals.nuisances:
-            null = effect.null_phi(len(trials), finite=True)
-            phi[effect.name] = null.reshape(1, len(trials), -1)
-        found[name] = simulator.predict(theta, phi)[0][0] / unit
-    return found

@@ -250,9 +250,7 @@ class Verdict:
     @cached_property
     def inclusion(self) -> dict[str, float]:
         """Probability of each effect among the admitted models."""
-        found = {
-            name: self.choice.inclusion.get(name, 0.0) for name in self.rivals.effects
-        }
+        found = dict.fromkeys(self.rivals.effects, 0.0) | self.choice.inclusion
         for key, p in self.choice.probabilities.items():
             for own, share in self.states.share(key).items():
                 for effect in self.states.louder(own):
@@ -288,18 +286,15 @@ class Verdict:
         It has what larger models say that predict left-out trials better.
         """
         search, own = self.search, self.search.found[key]
-        better = [
-            other
-            for other, c in search.found.items()
-            if {*other.effects} > {*key.effects}
-            and c.left.mean_square < own.left.mean_square
-        ]
+        larger = [k for k in search.found if {*k.effects} > {*key.effects}]
+        errors = {k: search.found[k].left.mean_square for k in larger}
+        better = [k for k in larger if errors[k] < own.left.mean_square]
         variance, away = self._variance(key), np.zeros_like(own.model.u)
         for other in better:
             at = search.columns(other, key)
             away = np.maximum(away, (self.model(other).u[at] - own.model.u) ** 2)
         if better:
-            best = min(better, key=lambda k: search.found[k].left.mean_square)
+            best = min(better, key=errors.__getitem__)
             its = self._variance(best)[search.columns(best, key)]
             variance = np.maximum(variance, its)
         return widened(self.covariance(key), variance + away, own.model)

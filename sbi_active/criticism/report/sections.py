@@ -198,20 +198,14 @@ def _sizes_left(report: Contents) -> dict[str, Any]:
 
 def _groups(report: Contents) -> list[tuple[frozenset[str], str]]:
     """Return the groups of models that nothing separates, or not these trials."""
-    tracing, aliases = report.tracing, []
-    for pair in tracing.aliases:  # pairs with names in common are one group
-        touching = [group for group in aliases if group & pair]
-        aliases = [group for group in aliases if group not in touching]
-        aliases.append(pair.union(*touching))
+    tracing = report.tracing
     near = [group for group in tracing.near if group not in tracing.equivalent]
-    same = "nearly the same here, apart by less than the noise; repeated trials may "
     return [
         *(
             (group, "no permitted action separates them")
             for group in tracing.equivalent
         ),
         *((g, "not separated by these trials; another action may") for g in near),
-        *((group, f"{same}separate them") for group in aliases),
     ]
 
 

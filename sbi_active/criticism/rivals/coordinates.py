@@ -37,6 +37,8 @@ class SearchCoordinates:
 
     Attributes:
         dim: Number of coordinates.
+        num_own: Number of those that are no nuisances.
+        places: Places of each effect's phi among the coordinates, by name.
         low: Lower bounds in u, shape (dim,).
         high: Upper bounds in u, shape (dim,).
         center: Center of the Gaussian that stands for the prior in a search, shape
@@ -53,8 +55,13 @@ class SearchCoordinates:
     ) -> None:
         self.joint = JointPrior(prior, effects)
         self.nuisances, self.num_trials = [*nuisances], num_trials
-        z = self._for_units()
-        self.dim = z.shape[1]
+        self.num_own = sum(self.joint.sizes)
+        self.places: dict[str, slice] = {}
+        at = self.joint.theta_dim
+        for effect, copies in self._parts():
+            self.places[effect.name] = slice(at, at + copies * effect.phi_dim)
+            at += copies * effect.phi_dim
+        self.dim, z = at, self._for_units()
         low, high = self._bounds()
         q = np.quantile(z, [0.05, 0.95], axis=0)
         self.is_log = (low >= 0) & (q[1] > WIDE * q[0])
@@ -117,13 +124,11 @@ class SearchCoordinates:
     def split(self, u: Array) -> tuple[Tensor, dict[str, Tensor]]:
         """Return theta and phi by effect, as the simulator takes them."""
         z = torch.from_numpy(self.to_z(u))
-        sizes = [e.phi_dim * self.num_trials for e in self.nuisances]
-        own, *rest = z.split([sum(self.joint.sizes), *sizes], -1)
-        theta, *parts = own.split(self.joint.sizes, -1)
-        phi = {e.name: p for e, p in zip(self.joint.effects, parts, strict=True)}
-        for effect, p in zip(self.nuisances, rest, strict=True):
-            phi[effect.name] = p.reshape(len(z), self.num_trials, effect.phi_dim)
-        return theta, phi
+        phi = {name: z[:, at] for name, at in self.places.items()}
+        for effect in self.nuisances:
+            shape = len(z), self.num_trials, effect.phi_dim
+            phi[effect.name] = phi[effect.name].reshape(shape)
+        return z[:, : self.joint.theta_dim], phi
 
     def log_prob(self, u: Array) -> Array:
         """Return log prior densities with respect to u, shape (n,)."""
@@ -134,14 +139,10 @@ class SearchCoordinates:
         # A bound itself may round to beyond.
         u = np.clip(u[inside], self.low + 1e-6, self.high - 1e-6)
         z = torch.from_numpy(self.to_z(u))
-        own = sum(self.joint.sizes)
-        log_p = self.joint.log_prob(z[:, :own]).double()
-        at = own
+        log_p = self.joint.log_prob(z[:, : self.num_own]).double()
         for effect in self.nuisances:
-            size = effect.phi_dim * self.num_trials
-            phi = z[:, at : at + size].reshape(-1, effect.phi_dim)
+            phi = z[:, self.places[effect.name]].reshape(-1, effect.phi_dim)
             log_p = log_p + effect.log_prob(phi).reshape(len(z), -1).sum(-1)
-            at += size
         jacobian = np.log(self.scale).sum()
         jacobian = jacobian + (u * self.scale + self.shift)[:, self.is_log].sum(1)
         density[inside] = log_p.numpy() + jacobian
@@ -153,8 +154,7 @@ class SearchCoordinates:
         The nuisances of different trials change different numbers of x, so that one
         step serves them all.
         """
-        own = sum(self.joint.sizes)
-        entry, at = [np.arange(own)], own
+        entry, at = [np.arange(self.num_own)], self.num_own
         for effect in self.nuisances:
             entry.append(np.tile(np.arange(at, at + effect.phi_dim), self.num_trials))
             at += effect.phi_dim
@@ -164,7 +164,12 @@ class SearchCoordinates:
         """Return the trial that each coordinate belongs to, -1 for all, (dim,)."""
         trials = np.arange(self.num_trials)
         own = [np.repeat(trials, effect.phi_dim) for effect in self.nuisances]
-        return np.concatenate([np.full(sum(self.joint.sizes), -1), *own])
+        return np.concatenate([np.full(self.num_own, -1), *own])
+
+    def _parts(self) -> list[tuple[Effect, int]]:
+        """Return the effects in their order, with how many of each there are."""
+        own = [(effect, 1) for effect in self.joint.effects]
+        return own + [(effect, self.num_trials) for effect in self.nuisances]
 
     def _for_units(self) -> Array:
         """Return draws by which each part has the same units beside any others.
@@ -175,13 +180,9 @@ class SearchCoordinates:
         num_draws = 1_000
         with forked_generators(0):
             parts = [self.joint.prior.sample(torch.Size([num_draws])).double()]
-        for effect in self.joint.effects:
+        for effect, copies in self._parts():
             with forked_generators(0, effect.name):
-                parts.append(effect.sample(num_draws).double())
-        for effect in self.nuisances:
-            with forked_generators(0, effect.name):
-                own = effect.sample(num_draws * self.num_trials).double()
-            parts.append(own.reshape(num_draws, -1))
+                parts.append(effect.sample(num_draws * copies).double())
         return torch.cat([part.reshape(num_draws, -1) for part in parts], -1).numpy()
 
     def _raw(self, num: int, *, seed: int) -> Array:
@@ -196,22 +197,15 @@ class SearchCoordinates:
         return np.where(self.is_log, np.log(safe), z)
 
     def _bounds(self) -> tuple[Array, Array]:
-        pairs = [
-            support_bounds(support_of(part), size)
-            for part, size in zip(self.joint._parts(), self.joint.sizes, strict=True)
-        ]
-        for e in self.nuisances:
-            low, high = support_bounds(support_of(e.prior), e.phi_dim)
-            low, high = (np.tile(end, self.num_trials) for end in (low, high))
-            pairs.append((low, high))
-        low, high = (np.concatenate(ends) for ends in zip(*pairs, strict=True))
-        at = self.joint.sizes[0]
-        for effect in self.joint.effects:
-            own = slice(at, at + effect.phi_dim)
-            least, most = dissipative_bounds(effect)
-            low[own] = np.maximum(low[own], least)
-            high[own] = np.minimum(high[own], most)
-            at += effect.phi_dim
+        joint = self.joint
+        pairs = [support_bounds(support_of(joint.prior), joint.theta_dim)]
+        for effect, copies in self._parts():
+            low, high = support_bounds(support_of(effect.prior), effect.phi_dim)
+            if effect.scope == "campaign":
+                least, most = dissipative_bounds(effect)
+                low, high = np.maximum(low, least), np.minimum(high, most)
+            pairs.append((np.tile(low, copies), np.tile(high, copies)))
+        low, high = np.concatenate(pairs, 1)
         return low, high
 
 

@@ -4,16 +4,9 @@ The correlation time and the size of the noise belong to the bare model and to e
 rival alike. Each is a grid, so that a likelihood is a sum over its cells and no rival
 pays for them with a coordinate.
 
-Where the size is unknown in each channel by itself, channels are independent given the
-parameters and the correlation time, and the sum over the sizes is one over each channel
-in turn,
-
-.. math::
-    p(r) = \sum_\tau w_\tau \prod_c \sum_s w_{cs}\, p(r_c \mid \tau, s\, \sigma_c),
-
-and no combination of sizes is looked at by itself. What has further unknowns that all
-channels share (a gross error in one trial, a smooth function of the action) takes the
-ratio of the sizes from the bare model's best fit, and sums over their common factor.
+Where the size is unknown in each channel by itself, fits tell the ratio of the sizes:
+that of the bare model, and that of the single effect which leaves least; their common
+factor is summed out.
 """
 
 from __future__ import annotations
@@ -102,29 +95,20 @@ class NoiseGrid:
         cells: Cells of the correlation time and the noise model's own parameters.
         scales: Factors on the standard deviation, shape (j,).
         log_weights: Log prior probabilities of these, shape (j,); None for equal ones.
-        offset: Log probability that is added to all, of noise that stands for another.
-        channel: Channel of each number, shape (N,), where each has a size of its own;
-            None for one size.
-        factors: Sizes of each channel in units of that of the cells, shape (c, s).
-        log_factors: Log prior probabilities of these, shape (c, s).
-        ratio: Sizes of the channels in those of the cells, shape (c,), where a
-            prediction asks for those of each.
+        is_by_channel: Whether each channel has a size of its own, which nothing says:
+            fits tell them (:meth:`sized`), and ``scales`` is their common factor.
     """
 
     cells: Sequence[NoiseCell]
     scales: Array = field(default_factory=lambda: np.ones(1))
     log_weights: Array | None = None
-    offset: float = 0.0
-    channel: NDArray[np.int64] | None = None
-    factors: Array = field(default_factory=lambda: np.ones((1, 1)))
-    log_factors: Array = field(default_factory=lambda: np.zeros((1, 1)))
-    ratio: Array = field(default_factory=lambda: np.ones(1))
+    is_by_channel: bool = False
 
     @cached_property
     def log_prior(self) -> Array:
         """Log prior probability of each cell."""
         weights = np.array([cell.log_weight for cell in self.cells])
-        return weights - log_sum_exp(weights) + self.offset
+        return weights - log_sum_exp(weights)
 
     @cached_property
     def log_scale_prior(self) -> Array:
@@ -136,7 +120,7 @@ class NoiseGrid:
     @property
     def is_known(self) -> bool:
         """Whether nothing of it is unknown, so that one transform whitens all."""
-        return len(self.cells) == self.factors.size == len(self.scales) == 1
+        return len(self.cells) == len(self.scales) == 1
 
     @property
     def typical_sd(self) -> Array:
@@ -149,10 +133,16 @@ class NoiseGrid:
 
     def joint(self, residual: Array) -> Array:
         """Return log p(residual, cell, scale), shape (n, cells, scales)."""
-        parts = []
+        parts, num = [], residual.shape[1]
         for cell, prior in zip(self.cells, self.log_prior, strict=True):
-            each = log_sum_exp(self._by_size(cell, residual), axis=3).sum(2)
-            parts.append(prior + self.log_scale_prior + each - cell.log_scale)
+            e = cell.whiten(residual)
+            if np.isinf(cell.df):
+                each = -0.5 * (e**2).sum(1)[:, None] / self.scales**2
+                each = each - 0.5 * num * LOG_2PI
+            else:
+                each = student(e[:, None] / self.scales[:, None], cell.df).sum(2)
+            each = each - num * np.log(self.scales) - cell.log_scale
+            parts.append(prior + self.log_scale_prior + each)
         return np.stack(parts, 1)
 
     def posterior(self, residual: Array) -> Array:
@@ -160,75 +150,35 @@ class NoiseGrid:
         joint = self.joint(residual[None])[0]
         return np.exp(joint - log_sum_exp(joint))
 
+    @cached_property
     def start(self) -> Whitener:
-        """Return the whitening transform to start a least-squares search with."""
+        """The whitening transform to start a least-squares search with."""
         middle = np.argsort(self.scales)[len(self.scales) // 2]
-        sizes = np.full(len(self.factors), self.scales[middle])
-        return self._whitener(int(np.argmax(self.log_prior)), sizes)
+        return self._whitener(int(np.argmax(self.log_prior)), int(middle))
 
     def whitener(self, residual: Array) -> Whitener:
         """Return the whitening transform that a residual (N,) makes most probable.
 
         It maps (..., N) to (..., N), linearly.
         """
-        return self._whitener(*self.likeliest(residual))
-
-    def likeliest(self, residual: Array) -> tuple[int, Array]:
-        """Return the cell and the sizes (c,) that a residual (N,) points to."""
         joint = self.joint(residual[None])[0]
         cell, scale = np.unravel_index(np.argmax(joint), joint.shape)
-        by_size = self._by_size(self.cells[int(cell)], residual[None])[0, scale]
-        best = by_size.argmax(1)
-        return int(cell), self.scales[scale] * self.factors[np.arange(len(best)), best]
-
-    def settled(self, residual: Array) -> NoiseGrid:
-        """Return noise with sizes whose ratio is that which a residual (N,) points to.
-
-        For that residual it is as probable as this one, so that models with either can
-        be compared. Noise of one size is this one.
-        """
-        if self.channel is None:
-            return self
-        _, ratio = self.likeliest(residual)
-        cells = [replace(c, sd=c.sd * ratio[self.channel]) for c in self.cells]
-        new = NoiseGrid(cells, scales=np.geomspace(1 / 30, 30, 40), ratio=ratio)
-        one = residual[None]
-        apart = self.log_likelihood(one) - new.log_likelihood(one)
-        return replace(new, offset=apart[0])
+        return self._whitener(int(cell), int(scale))
 
     def noise_posterior(
         self, residual: Array, rng: np.random.Generator
     ) -> tuple[NDArray[np.intp], Array]:
-        """Return a cell and sizes of the noise for each residual, at random.
+        """Return a cell and a size of the noise for each residual, at random.
 
         Args:
             residual: Residuals, shape (n, N).
             rng: Source of the draws.
 
         Returns:
-            Cells, shape (n,), and factors on their deviations by channel, shape (n, c).
+            Cells, and factors on their deviations, shapes (n,).
         """
         cells, scales = drawn(self.joint(residual), rng)
-        sizes = self.sizes(self.scales[scales])
-        if self.channel is None:
-            return cells, sizes
-        sizes = np.repeat(sizes, len(self.factors), 1)
-        for cell in np.unique(cells):
-            own = np.flatnonzero(cells == cell)
-            by_size = self._by_size(self.cells[cell], residual[own])
-            at_scale = by_size[np.arange(len(own)), scales[own]]
-            for c, factors in enumerate(self.factors):
-                (picked,) = drawn(at_scale[:, c], rng)
-                sizes[own, c] *= factors[picked]
-        return cells, sizes
-
-    def sizes(self, scales: Array) -> Array:
-        """Return the sizes of the channels that scales (n,) stand for, (n, c)."""
-        return scales[:, None] * self.ratio
-
-    def by_number(self, sizes: Array) -> Array:
-        """Return the size of each number, shape (n, N), from those of channels."""
-        return sizes[:, self._groups]
+        return cells, self.scales[scales]
 
     def errors(
         self, cells: Array, sizes: Array, rng: np.random.Generator
@@ -237,33 +187,40 @@ class NoiseGrid:
 
         Args:
             cells: Cell of each draw, shape (n,).
-            sizes: Factors on the cell's deviations, shape (n, N).
+            sizes: Factors on the cell's deviations, shape (n,).
             rng: Source of the errors.
         """
         own = [self.cells[cell] for cell in cells]
-        rho, u = np.stack([cell.rho for cell in own]), rng.normal(size=sizes.shape)
+        rho = np.stack([cell.rho for cell in own])
+        u = rng.normal(size=rho.shape)
         for row, cell in zip(u, own, strict=True):
             if np.isfinite(df := cell.df):
                 row[:] = rng.standard_t(df, size=len(row)) * np.sqrt((df - 2) / df)
         for k in range(1, u.shape[1]) if rho.any() else ():
             step = np.sqrt(1 - rho[:, k] ** 2) * u[:, k]
             u[:, k] = rho[:, k] * u[:, k - 1] + step
-        sd = np.stack([cell.sd for cell in own]) * sizes
+        sd = np.stack([cell.sd for cell in own]) * sizes[:, None]
         return u * sd, sd
 
     def log_density(self, cells: Array, sizes: Array, residual: Array) -> Array:
         """Return log densities of residuals (n, N), each in its cell, shape (n,)."""
-        log_p, u = np.empty(len(residual)), residual / sizes
+        log_p, u = np.empty(len(residual)), residual / sizes[:, None]
         for cell in np.unique(cells):
             own, alone = cells == cell, replace(self.cells[cell], log_weight=0.0)
             log_p[own] = NoiseGrid([alone]).log_likelihood(u[own])
-        return log_p - np.log(sizes).sum(1)
+        return log_p - residual.shape[1] * np.log(sizes)
 
     def scaled(self, scales: Array, log_weights: Array) -> NoiseGrid:
         """Return this noise with further factors on its standard deviation."""
         product = np.multiply.outer(self.scales, scales).ravel()
         weight = np.add.outer(self.log_scale_prior, log_weights).ravel()
         return replace(self, scales=product, log_weights=weight)
+
+    def sized(self, sds: Sequence[Array]) -> NoiseGrid:
+        """Return this noise with one of some deviations, each of shape (N,)."""
+        return replace(
+            self, cells=[replace(c, sd=sd) for sd in sds for c in self.cells]
+        )
 
     def with_extra(self, sd: Array) -> NoiseGrid:
         """Return this noise with an independent error of deviation sd, shape (N,)."""
@@ -272,36 +229,11 @@ class NoiseGrid:
 
     def part(self, at: NDArray[np.bool_]) -> NoiseGrid:
         """Return this noise of some of the numbers, shape (N,)."""
-        channel = None if self.channel is None else self.channel[at]
-        return replace(self, cells=[c.part(at) for c in self.cells], channel=channel)
+        return replace(self, cells=[cell.part(at) for cell in self.cells])
 
-    @property
-    def _groups(self) -> NDArray[np.int64]:
-        """Channel of each number among those with sizes of their own, shape (N,)."""
-        if self.channel is None:
-            return np.zeros(len(self.cells[0].sd), dtype=np.int64)
-        return self.channel
-
-    def _whitener(self, cell: int, sizes: Array) -> Whitener:
-        own, unit = self.cells[cell], sizes[self._groups]
-        return lambda residual: own.whiten(residual) / unit
-
-    def _by_size(self, cell: NoiseCell, residual: Array) -> Array:
-        """Return log p(residual of a channel, size | cell, scale), (n, j, c, s).
-
-        Up to the log scale of the cell.
-        """
-        member = self._groups[:, None] == np.arange(len(self.factors))
-        e, count = cell.whiten(residual), member.sum(0)[:, None]
-        size = self.scales[:, None, None] * self.factors
-        if np.isinf(cell.df):
-            log_p = -0.5 * (e**2 @ member)[:, None, :, None] / size**2
-            log_p = log_p - 0.5 * count * LOG_2PI
-        else:
-            each = student(e[:, None, :, None] / size[:, self._groups], cell.df)
-            log_p = np.einsum("njis,ic->njcs", each, member)
-        total = log_sum_exp(self.log_factors, axis=1)[:, None]
-        return log_p - count * np.log(size) + (self.log_factors - total)
+    def _whitener(self, cell: int, scale: int) -> Whitener:
+        own, size = self.cells[cell], self.scales[scale]
+        return lambda residual: own.whiten(residual) / size
 
 
 def drawn(log_p: Array, rng: np.random.Generator) -> tuple[NDArray[np.intp], ...]:

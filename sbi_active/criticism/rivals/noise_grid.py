@@ -91,16 +91,16 @@ def _product(noise: NoiseModel, measurements: Measurements) -> NoiseGrid | None:
     if not torch.equal(weights, weights[:1].expand_as(weights)):
         return None
     middle = (weights[0].exp() * sd.nodes.log()).sum(1).exp()
-    factors, log_factors = (sd.nodes / middle[:, None]).numpy(), weights[0].numpy()
-    channel = _channel_of(measurements, sd.num_channels)
-    unit = middle.numpy()[channel]
+    unit = middle.numpy()[_channel_of(measurements, sd.num_channels)]
     cells = [
         NoiseCell.of(measurements, sd=unit, correlation_time=tau, log_weight=log_p)
         for tau, log_p in posterior.cells
     ]
     if sd.num_channels == 1:
-        return NoiseGrid(cells, scales=factors[0], log_weights=log_factors[0])
-    return NoiseGrid(cells, channel=channel, factors=factors, log_factors=log_factors)
+        factors = (sd.nodes / middle[:, None]).numpy()[0]
+        return NoiseGrid(cells, scales=factors, log_weights=weights[0, 0].numpy())
+    # From a thirtieth of the sizes that fits tell to thirty times these.
+    return NoiseGrid(cells, scales=np.geomspace(1 / 30, 30, 40), is_by_channel=True)
 
 
 def measurement_sds(noise: NoiseModel | None, measurements: Measurements) -> Any:

@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 
 from sbi_active.arrays import Array
 from sbi_active.criticism.data.measurements import Measurements
-from sbi_active.criticism.rivals.error_models import LOG_2PI, NoiseGrid, Whitener, drawn
+from sbi_active.criticism.rivals.error_models import LOG_2PI, NoiseGrid, drawn
 from sbi_active.inference.sampling.eigen import eigh
 from sbi_active.inference.sampling.weights import log_sum_exp
 
@@ -67,8 +67,6 @@ class ResidualProcess:
         spread: Deviation of the prior predictive, shape (N,); None has the noise as the
             only unit.
     """
-
-    is_known = False
 
     def __init__(
         self,
@@ -114,28 +112,6 @@ class ResidualProcess:
         """Return log densities, shape (n,), of residuals, shape (n, N)."""
         return log_sum_exp(self._joint(residual).reshape(len(residual), -1), axis=1)
 
-    def start(self) -> Whitener:
-        """Return the whitening transform to start a least-squares search with."""
-        return self.noise.start()
-
-    def whitener(self, residual: Array) -> Whitener:
-        """Return the whitening transform that a residual (N,) makes most probable."""
-        basis, a, scale = self._likeliest(residual)
-        cell = self.noise.cells[basis.cell]
-        shrink = 1 / np.sqrt(1 + a**2 * basis.variances) - 1
-
-        def whiten(residual: Array) -> Array:
-            e = cell.whiten(residual) / scale
-            return e + ((e @ basis.directions) * shrink) @ basis.directions.T
-
-        return whiten
-
-    def _likeliest(self, residual: Array) -> tuple[_Basis, float, float]:
-        """Return the process, amplitude and scale that a residual (N,) points to."""
-        joint = self._joint(residual[None])[0]
-        basis, a, scale = np.unravel_index(np.argmax(joint), joint.shape)
-        return self._bases[basis], self.amplitudes[a], self.noise.scales[scale]
-
     def condition(
         self,
         residual: Array,
@@ -164,8 +140,10 @@ class ResidualProcess:
         Returns:
             Means, shape (n, M), and standard deviations, shape (M,).
         """
-        basis, a, scale = self._likeliest(residual.mean(0))
-        cell = self.noise.cells[basis.cell]
+        joint = self._joint(residual.mean(0)[None])[0]
+        best, at, size = np.unravel_index(np.argmax(joint), joint.shape)
+        basis, a = self._bases[best], self.amplitudes[at]
+        cell, scale = self.noise.cells[basis.cell], self.noise.scales[size]
         place_of = self._inputs(action, order)[basis.kind]
         own = _coordinates(self.measurements, place_of, self.measurements.span)
         there = _coordinates(new, place_of[-new.shape[0] :], self.measurements.span)
@@ -189,7 +167,7 @@ class ResidualProcess:
         """Return a cell and a size of the noise for each residual, at random."""
         basis, _, scale = drawn(self._joint(residual), rng)
         cells = np.array([b.cell for b in self._bases])[basis]
-        return cells, self.noise.sizes(self.noise.scales[scale])
+        return cells, self.noise.scales[scale]
 
     def _relative(self, spread: Array, sd: Array) -> Array:
         """Return the spread, in the median as large as the noise."""

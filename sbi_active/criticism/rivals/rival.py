@@ -65,7 +65,6 @@ class Rival:
         self.coordinates = SearchCoordinates(
             self.prior, self.effects, self.nuisances, self.num_trials
         )
-        self._white = self.error.start()
 
     @property
     def dim(self) -> int:
@@ -77,25 +76,18 @@ class Rival:
         """Number of coordinates of the simulator's own parameters."""
         return int(self.prior.event_shape[0])
 
-    def columns(self) -> dict[str, slice]:
-        """Return the places of each effect's phi among the coordinates, by name."""
-        sizes = [(e.name, e.phi_dim) for e in self.effects]
-        num = self.coordinates.num_trials
-        sizes += [(e.name, e.phi_dim * num) for e in self.coordinates.nuisances]
-        at = self.dim - sum(size for _, size in sizes)
-        found = {}
-        for name, size in sizes:
-            found[name] = slice(at, at + size)
-            at += size
-        return found
+    @property
+    def noise(self) -> NoiseGrid:
+        """The error without a residual process, which no search has to follow."""
+        return self.error if isinstance(self.error, NoiseGrid) else self.error.noise
 
     @property
     def searched(self) -> NDArray[np.bool_]:
         """Coordinates that a least-squares search may move: not those of the noise."""
-        joint = self.coordinates.joint
-        own = [e.hook != "noise" for e in joint.effects]
-        flags = np.repeat([True, *own], joint.sizes)
-        return np.concatenate([flags, np.ones(self.dim - len(flags), bool)])
+        flags = np.ones(self.dim, dtype=bool)
+        for effect in self.coordinates.joint.effects:
+            flags[self.coordinates.places[effect.name]] = effect.hook != "noise"
+        return flags
 
     def residual(
         self, u: Array, *, penalized: bool = True
@@ -161,9 +153,9 @@ class Rival:
 
         It is the same object if the error has nothing unknown, and without u.
         """
-        if u is None or self.error.is_known:
-            return self._white
-        return self.error.whitener(self.residual(u)[0][0])
+        if u is None or self.noise.is_known:
+            return self.noise.start
+        return self.noise.whitener(self.residual(u)[0][0])
 
     def log_likelihood(self, u: Array, *, floor: float = -np.inf) -> Array:
         """Return log p(x | z), shape (n,); all trials are simulated at once."""
@@ -210,7 +202,6 @@ class Rival:
         for k, group in enumerate(groups):
             change = (r[k + 1] - r[0]) / step[group > 0][0]
             for j in np.flatnonzero(group):
-                part = sign[:, j, None] * change
-                mine = trial_of[j] < 0
-                jac[:, :, j] = part if mine else part * (trial == trial_of[j])
+                own = (trial_of[j] < 0) | (trial == trial_of[j])
+                jac[:, :, j] = np.where(own, sign[:, j, None] * change, 0.0)
         return r[0], jac

@@ -62,6 +62,7 @@ class TrialSimulator:
             trials, self._model_times, is_sequence="correlation_time" in names
         )
         self.is_stochastic = model.noise is None
+        self._repeats = NUM_REPLICATES if self.is_stochastic else 1
         self.num_simulations, self.failed = 0, False
         self._dtype = torch.float64
         self._known: RowCache[Prediction] = RowCache(KEPT)
@@ -99,32 +100,22 @@ class TrialSimulator:
         rows = torch.cat([part.double() for part in columns], 1).numpy()
 
         def simulate(at: Array) -> list[Prediction]:
-            some = {k: p[at] for k, p in phi.items()}
-            mean, sd, valid = self._predict_all(theta[at], some)
-            each = [None] * len(at) if sd is None else sd
-            return [*zip(mean, each, valid, strict=True)]
+            numbers = int(np.prod(self.measurements.shape)) + self._num_inputs()
+            most = max(1, CHUNK // max(1, numbers * self._repeats))
+            if self.is_stochastic and not self.model.base.fn_takes_seeds:
+                most = 1  # the global generators draw the same for all
+            found = []
+            for start in range(0, len(at), most):
+                some = at[start : start + most]
+                found += self._predict(
+                    theta[some], {k: p[some] for k, p in phi.items()}
+                )
+            return found
 
         found = self._known.get((*names,), rows, simulate)
         mean, sd, valid = zip(*found, strict=True)
         joined = None if sd[0] is None else np.stack(sd)
         return np.stack(mean), joined, np.stack(valid)
-
-    def _predict_all(
-        self, theta: Tensor, phi: dict[str, Tensor]
-    ) -> tuple[Array, Array | None, Array]:
-        repeats = NUM_REPLICATES if self.is_stochastic else 1
-        numbers = int(np.prod(self.measurements.shape)) + self._num_inputs()
-        most = max(1, CHUNK // max(1, numbers * repeats))
-        if self.is_stochastic and not self.model.base.fn_takes_seeds:
-            most = 1  # the global generators draw the same for all
-        parts = []
-        for start in range(0, len(theta), most):
-            rows = slice(start, start + most)
-            some = {name: p[rows] for name, p in phi.items()}
-            parts.append(self._predict(theta[rows], some, repeats))
-        mean, sd, valid = zip(*parts, strict=True)
-        joined = None if sd[0] is None else np.concatenate(sd)
-        return np.concatenate(mean), joined, np.concatenate(valid)
 
     def _num_inputs(self) -> int:
         """Return the count of numbers in all trials' inputs."""
@@ -146,10 +137,9 @@ class TrialSimulator:
         flat = scale.double().numpy().reshape(num, -1)
         return flat[:, self.measurements.position]
 
-    def _predict(
-        self, theta: Tensor, phi: dict[str, Tensor], repeats: int
-    ) -> tuple[Array, Array | None, Array]:
-        n, t = len(theta), len(self.trials)
+    def _predict(self, theta: Tensor, phi: dict[str, Tensor]) -> list[Prediction]:
+        """Return what :meth:`predict` returns, row by row."""
+        n, t, repeats = len(theta), len(self.trials), self._repeats
         self.num_simulations += n * t * repeats
         action, context = self._rows(n, repeats)
         seeds = None
@@ -163,9 +153,10 @@ class TrialSimulator:
         valid = np.isfinite(flat.reshape(n, repeats, t, -1)).any(-1).mean(1)
         self.failed |= bool((valid < 1).any())
         picked = flat[..., self.measurements.position]
-        if not self.is_stochastic:
-            return picked[:, 0], None, valid
-        return *_moments(picked), valid
+        mean, sd = picked[:, 0], [None] * n
+        if self.is_stochastic:
+            mean, sd = _moments(picked)
+        return [*zip(mean, sd, valid, strict=True)]
 
     def _simulate(
         self,
@@ -175,25 +166,24 @@ class TrialSimulator:
         context: Context,
         seeds: Tensor | None,
     ) -> Tensor:
-        def run(dtype: torch.dtype) -> Tensor:
-            return self.model.evaluate(
-                theta.to(dtype),
-                {name: p.to(dtype) for name, p in phi.items()},
-                action.to(dtype),
-                context=context,
-                seeds=seeds,
-                merge=self._has_repeats,
-            )
-
-        if self._dtype == torch.float64:
+        while True:
+            dtype = self._dtype
             try:
-                return run(torch.float64)
+                return self.model.evaluate(
+                    theta.to(dtype),
+                    {name: p.to(dtype) for name, p in phi.items()},
+                    action.to(dtype),
+                    context=context,
+                    seeds=seeds,
+                    merge=self._has_repeats,
+                )
             except RuntimeError as error:
                 # A simulator that holds single-precision tensors of its own.
-                if "dtype" not in str(error) and "Double" not in str(error):
+                words = "dtype", "Double"
+                told = any(word in str(error) for word in words)
+                if not told or dtype == torch.float32:
                     raise
                 self._dtype = torch.float32
-        return run(torch.float32)
 
     def _rows(self, num: int, repeats: int) -> tuple[Tensor, Context]:
         """Return action and conditions, one row a trial, for all parameters."""

@@ -181,8 +181,8 @@ def _beside_process(misfit: Misfit, m: Measurements, num: int, seed: int) -> Arr
     sensor = misfit.sensor[m.channel]
     time = 0.0 if np.isnan(misfit.time_scale) else misfit.time_scale
     cell = NoiseCell.of(m, sd=misfit.size * sensor, correlation_time=time)
-    cells, ones = np.zeros(num, dtype=np.intp), np.ones((num, len(m)))
-    process, _ = NoiseGrid([cell]).errors(cells, ones, rng)
+    cells = np.zeros(num, dtype=np.intp)
+    process, _ = NoiseGrid([cell]).errors(cells, np.ones(num), rng)
     return process + sensor * rng.normal(size=process.shape)
 
 

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
+from torch import Tensor
 
 from sbi_active.arrays import Array
 from sbi_active.criticism.data.measurements import Measurements
@@ -16,9 +18,97 @@ from sbi_active.criticism.rivals.error_models import LOG_2PI
 from sbi_active.criticism.rivals.residual_process import ResidualProcess
 from sbi_active.criticism.rivals.trial_simulator import TrialSimulator
 from sbi_active.criticism.rivals.validity import log_outcomes
-from sbi_active.criticism.steps.nuisances import conditioned, is_first_part
 from sbi_active.inference.sampling.weights import log_sum_exp
 from sbi_active.seeding import derive_seed, forked_generators
+
+
+def conditioned(
+    rivals: RivalSet,
+    fit: Fit,
+    u: Array,
+    simulator: TrialSimulator,
+    rng: np.random.Generator,
+) -> tuple[Tensor, dict[str, Tensor]]:
+    """Return theta and phi with nuisances drawn given the first part of each trial.
+
+    They are solved for within each trial at the mean of the draws, linearized there,
+    and drawn for each: their posterior is Gaussian given the draw.
+
+    Args:
+        rivals: The models, which say how long the first part is.
+        fit: Fit of the model.
+        u: Draws of its coordinates, shape (n, dim).
+        simulator: Simulator of the trials that were not fitted.
+        rng: Source of the draws.
+    """
+    m = simulator.measurements
+    center, spread = rivals.prior_predictive(simulator)
+    error = rivals.noise_of(m)
+    given = {"error": error, "spread": spread, "center": center}
+    rival = replace(fit.rival, simulator=simulator, **given)
+    own = fit.rival.residual(u.mean(0, keepdims=True))[0][0]
+    size = np.sqrt(np.mean((own / rivals.noise.typical_sd) ** 2))
+    unit = error.typical_sd * max(size, 1e-3)
+    c, first = rival.coordinates, is_first_part(m, rivals.warm_up)
+    num_own = c.num_own
+    z = np.zeros((len(u), c.dim))
+    z[:, :num_own] = fit.rival.coordinates.to_z(u)[:, :num_own]
+    draws = c.from_z(z)
+    draws[:, num_own:] = c.center[num_own:]
+    point = draws.mean(0, keepdims=True)
+
+    def whiten(residual: Array) -> Array:
+        return residual / unit
+
+    blocks = [
+        (np.flatnonzero(c.trial_of() == t), np.flatnonzero(first & (m.trial == t)))
+        for t in range(len(simulator))
+    ]
+    gains: list[tuple[Array, Array]] = []
+    for _ in range(4):  # Gauss-Newton steps
+        r, jacobian = rival.jacobian(point, whiten, rivals.step)
+        gains = [_gain(jacobian[0], c.precision, *block) for block in blocks]
+        _correct(point, r, c.center, c.precision, blocks, gains)
+        point = np.clip(point, c.low, c.high)
+    draws[:, num_own:] = point[:, num_own:]
+    r = whiten(rival.residual(draws)[0])
+    _correct(draws, r, c.center, c.precision, blocks, gains)
+    for (columns, _), (_, cov) in zip(blocks, gains, strict=True):
+        factor = np.linalg.cholesky(cov)
+        draws[:, columns] += rng.normal(size=(len(u), len(columns))) @ factor.T
+    return c.split(np.clip(draws, c.low, c.high))
+
+
+def is_first_part(m: Measurements, warm_up: float) -> NDArray[np.bool_]:
+    """Return a mask of numbers within a time of their trial's first, shape (N,)."""
+    begin = np.full(m.shape[0], np.inf)
+    np.minimum.at(begin, m.trial, m.time)
+    return m.time - begin[m.trial] < warm_up
+
+
+def _gain(
+    jacobian: Array, precision: Array, columns: Array, rows: Array
+) -> tuple[Array, Array]:
+    """Return the response of nuisances to the first part's residual, and their cov."""
+    part = jacobian[np.ix_(rows, columns)]
+    prior = np.diag(np.maximum(precision[columns], 1e-6))
+    cov = np.linalg.inv(part.T @ part + prior)
+    return cov @ part.T, cov
+
+
+def _correct(
+    u: Array,
+    residual: Array,
+    center: Array,
+    precision: Array,
+    blocks: list[tuple[Array, Array]],
+    gains: list[tuple[Array, Array]],
+) -> None:
+    """Take a Gauss-Newton step of each trial's nuisances, in place."""
+    for (columns, rows), (gain, cov) in zip(blocks, gains, strict=True):
+        pull = (u[:, columns] - center[columns]) * precision[columns]
+        u[:, columns] -= residual[:, rows] @ gain.T + pull @ cov
+
 
 #: A choice: each draw costs a simulation of every trial.
 NUM_DRAWS = 200
@@ -114,13 +204,12 @@ def predict(
             for effect in rivals.nuisances:  # an unseen trial draws its own
                 fresh = effect.sample(num_draws * len(target))
                 phi[effect.name] = fresh.reshape(num_draws, len(target), -1)
-    known = trials is None and not simulator.is_stochastic  # are simulated already
-    source = rivals.simulator if known else simulator
-    mean, unit, probability = source.predict(theta, phi)
+    if trials is None and not simulator.is_stochastic:  # simulated already
+        simulator = rivals.simulator
+    mean, unit, probability = simulator.predict(theta, phi)
     at_best = None
     if trials is not None and fit.best is not None and not rivals.nuisances:
-        at = rival.coordinates.split(fit.best[None])
-        at_best = simulator.predict(*at)[0][0]
+        at_best = simulator.predict(*rival.coordinates.split(fit.best[None]))[0][0]
         at_best = np.where(np.isfinite(at_best), at_best, mean.mean(0))
     noise = rivals.noise_of(m)
     factor = simulator.noise_scale(phi, num_draws)
@@ -132,10 +221,6 @@ def predict(
     if missing.any():  # all that is known of such a number is the prior predictive
         wide = spread / noise.typical_sd
         mean, factor = np.where(missing, center, mean), np.where(missing, wide, factor)
-    flags = [
-        log_outcomes(p[:, None], v[None])
-        for p, v in zip(probability.T, m.valid, strict=True)
-    ]
     extra = np.zeros(len(m))
     if isinstance(rival.error, ResidualProcess):
         shift, extra = rival.error.condition(
@@ -147,7 +232,6 @@ def predict(
         )
         mean = mean + shift
     cells, sizes = fit.error.noise_posterior(own_residual, rng)
-    sizes = noise.by_number(sizes)
     errors, sd = noise.errors(cells, sizes, rng)
     errors, sd = errors * factor, np.sqrt((sd * factor) ** 2 + extra**2)
     errors = errors + extra * rng.normal(size=mean.shape)
@@ -160,9 +244,9 @@ def predict(
             each[:, t] = (-0.5 * e**2 - own - 0.5 * LOG_2PI).sum(1)
         else:
             e, log_scale = residual / factor[:, at], np.log(factor[:, at]).sum(1)
-            log_p = noise.part(at).log_density(cells, sizes[:, at], e)
+            log_p = noise.part(at).log_density(cells, sizes, e)
             each[:, t] = log_p - log_scale
-        each[:, t] += flags[t]
+        each[:, t] += log_outcomes(probability[:, [t]], m.valid[[t]])
     kept = ~drops
     return Prediction(
         mean[:, kept],

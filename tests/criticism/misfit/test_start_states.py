@@ -85,7 +85,7 @@ def test_a_held_out_trial_tells_of_its_start_by_its_first_samples(found):
 def test_start_states_are_those_of_least_squares(found):
     """Drawn given the first samples, against a search over the start alone."""
     from sbi_active.criticism.rivals.trial_simulator import TrialSimulator
-    from sbi_active.criticism.steps.nuisances import conditioned
+    from sbi_active.criticism.steps.predictive import conditioned
 
     criticism, own, start = found
     criticism.trace()

@@ -12,7 +12,7 @@ from torch.distributions import HalfNormal, Independent, Normal
 
 from sbi_active import GaussianNoise, SimulatorModel
 from sbi_active.criticism import Criticism, Effect, Trials
-from sbi_active.criticism.misfit.wider_prior import beyond_bounds
+from sbi_active.criticism.misfit.contrary import beyond_bounds
 from sbi_active.criticism.results import NONE, UNEXPLAINED
 
 SENSOR = 0.005

@@ -71,7 +71,6 @@ def tracing(verdict: str = "drag", **changes) -> Tracing:
         credible_set=("drag", "tilt"),
         equivalent=(),
         near=(),
-        aliases=(),
         estimates=tuple(estimate(n, probabilities[n]) for n in NAMES),
         evidences={n: evidence(n, -3.0) for n in ["none", *NAMES, "unexplained"]},
         robust=True,

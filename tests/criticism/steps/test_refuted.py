@@ -1,6 +1,7 @@
 """What refutes a verdict: errors left out, held out, and of single trials."""
 
 import math
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -47,8 +48,11 @@ def evidence(key, names, center, log_z, square):
     )
 
 
-def anywhere(key, z):
-    return z
+def models(low=-np.inf, high=np.inf):
+    """Models whose prior has some bounds."""
+    within = SimpleNamespace(within=lambda z: np.clip(z, low, high))
+    rival = SimpleNamespace(coordinates=within)
+    return SimpleNamespace(seed=0, rival=lambda key: rival)
 
 
 def tracing(*found, chosen=("a",), estimates=()):
@@ -60,7 +64,6 @@ def tracing(*found, chosen=("a",), estimates=()):
         credible_set=(),
         equivalent=(),
         near=(),
-        aliases=(),
         estimates=estimates,
         evidences={e.name: e for e in found},
         robust=True,
@@ -73,7 +76,7 @@ OTHER = evidence(ModelKey(("b",)), ("theta", "b"), [1.5, 0.7], -50.0, 100.0)
 
 
 def test_a_refuted_model_is_spread_as_far_as_what_explains_moves_it():
-    found = widened(tracing(BARE, BEST, OTHER), 0, anywhere).evidences
+    found = widened(tracing(BARE, BEST, OTHER), models()).evidences
     assert found["none"].draws.mean() == pytest.approx(2.0, abs=0.05)
     # Four times as wide by the chi-squares, and a deviation of one apart.
     assert found["none"].draws.std() == pytest.approx(1.0, rel=0.05)
@@ -95,11 +98,8 @@ def test_draws_stay_within_the_prior_and_estimates_follow_them():
         effective_sample_size=4_000.0,
         engine="least squares",
     )
-    found = widened(
-        tracing(BEST, OTHER, estimates=(estimate,)),
-        0,
-        lambda key, z: np.clip(z, [1.2, 0.0], [1.6, 0.71]),
-    )
+    bounds = models([1.2, 0.0], [1.6, 0.71])
+    found = widened(tracing(BEST, OTHER, estimates=(estimate,)), bounds)
     draws = found.evidences["b"].draws
     assert (draws.min(0) >= [1.2, 0.0]).all()
     assert (draws.max(0) <= [1.6, 0.71]).all()
