@@ -358,7 +358,7 @@ class Criticism:
             exploratory: Whether library or priors were changed after the data were
                 seen; the report then warns of it.
         """
-        from sbi_active.criticism.reporting import report_of
+        from sbi_active.criticism.report.report import report_of
 
         held_out = self._parts[1].held_out
         evaluation = self.evaluate() if evaluate else None

@@ -9,9 +9,7 @@ import numpy as np
 
 from sbi_active.criticism.report.contents import Contents
 from sbi_active.criticism.report.summary import added
-from sbi_active.criticism.report.words import phrase
 from sbi_active.criticism.results import Array, Evaluation, Residuals, Tracing
-from sbi_active.display.page import Picture
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -23,6 +21,14 @@ METRICS = {
     "energy score": "energy score",
     "log predictive density": "log predictive density [nats]",
     "coverage": "share inside the central 90 %",
+}
+CAPTIONS = {
+    "residuals": "Residuals of the models refitted to all trials, in standard "
+    "deviations of the prediction; the band is two of them. Each row has its scale, "
+    "logarithmic beyond the band where residuals are large.",
+    "probabilities": "Posterior probability of the models that were tried.",
+    "before_after": "One line a scored trial; the bars are over all of them. Lower is "
+    "better for the first two, higher for the third; the dotted line is 90 %.",
 }
 
 
@@ -42,11 +48,6 @@ def figures(report: Contents) -> dict[str, Figure]:
     if report.evaluation is not None:
         found["before_after"] = plot_before_after(report.evaluation)
     return found
-
-
-def pictured(name: str) -> Picture:
-    """Return the place of the figure with a name."""
-    return Picture(name, phrase(f"figure, {name}"), phrase(f"figure, {name}"))
 
 
 def plot_residuals(

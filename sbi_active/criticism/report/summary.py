@@ -135,14 +135,9 @@ def not_told_from(tracing: Tracing, names: Collection[str]) -> list[str]:
     return sorted(frozenset().union(*groups).difference(names))
 
 
-def suspects(tracing: Tracing) -> tuple[float, ...]:
-    """Return the indices of trials that hold 90 % of a gross error's probability."""
-    return credible_set(tracing.outliers)
-
-
 def suspects_in_words(tracing: Tracing) -> str:
-    """Return the trials of which one may have a gross error."""
-    names = [_called(tracing, index) for index in suspects(tracing)]
+    """Return the trials that hold 90 % of the probability of a gross error."""
+    names = [_called(tracing, index) for index in credible_set(tracing.outliers)]
     return f"trial {listed(names, 'or')}" if names else "one trial"
 
 
