@@ -13,11 +13,13 @@ from typing_extensions import override
 
 from sbi_active.criticism.effects.application import (
     applied,
-    change_at_null,
+    largest_change,
+    nulls,
     require_positive,
 )
 from sbi_active.criticism.effects.declarations import require_distinct
 from sbi_active.criticism.effects.effect import Context, Effect
+from sbi_active.expected import require
 from sbi_active.seeding import forked_generators, row_seeds
 from sbi_active.simulation import SimulatorModel
 from sbi_active.simulation.conditions import CONDITIONS, at_rows, played, typed
@@ -176,11 +178,9 @@ class AugmentedSimulator(SimulatorModel):
         campaign = [e for e in self.effects if e.scope == "campaign"]
         sizes = [e.phi_dim for e in campaign]
         theta_dim = parameters.shape[1] - sum(sizes)
-        if theta_dim < 1:
-            raise ValueError(
-                f"expected (theta, phi) with {sum(sizes)} numbers for the effects; got "
-                f"{parameters.shape[1]} columns; draw from joint_prior"
-            )
+        expected = f"(theta, phi) with {sum(sizes)} numbers for the effects"
+        got = f"{parameters.shape[1]} columns"
+        require(theta_dim > 0, expected, got, "draw from joint_prior")
         theta, *phi = parameters.split([theta_dim, *sizes], -1)
         return theta, {e.name: p for e, p in zip(campaign, phi, strict=True)}
 
@@ -290,17 +290,13 @@ class AugmentedSimulator(SimulatorModel):
         """Return what the simulator's function is told of how its trials are run."""
         context, wanted = rows.context, self.base.conditions
         for effect in self._active("input", rows.phi):
-            if context.inputs is None or "inputs" not in wanted:
-                got = (
-                    "none in the trials"
-                    if context.inputs is None
-                    else "no such argument"
-                )
-                raise ValueError(
-                    f"expected inputs over time for effect {effect.name!r}, in the "
-                    f"trials and as an argument of the simulator's function; got {got}"
-                    "; pass Trials(inputs=...), and take fn(theta, action, *, inputs)"
-                )
+            require(
+                context.inputs is not None and "inputs" in wanted,
+                f"inputs over time for effect {effect.name!r}, in the trials and as an "
+                "argument of the simulator's function",
+                "no such argument" if context.inputs else "none in the trials",
+                "pass Trials(inputs=...), and take fn(theta, action, *, inputs)",
+            )
         inputs = self._through("input", context.inputs, rows)
         every = {**vars(context), "inputs": inputs}
         if context.times is not None:
@@ -341,28 +337,28 @@ class AugmentedSimulator(SimulatorModel):
             # As many rows as entries hide phi that is spread over the wrong axis.
             self._check_null(theta[:-1], action[:-1], context.at(slice(-1)))
             return
-        finite = x[x.isfinite()]
-        spread = float(finite.double().std()) if finite.numel() > 1 else 0.0
+        finite, one = x[x.isfinite()].double(), torch.ones_like(x)
+        spread = float(finite.std()) if len(finite) > 1 else 0.0
         scale = max(spread, float(finite.abs().mean()) if len(finite) else 0.0, 1e-30)
         for effect in self._unchecked:
-            changed, without, allowed = "x", x, tolerance * scale
+            changed, without, size = "x", x, scale
             if effect.hook == "noise":
-                changed, without, allowed = "the noise", torch.ones_like(x), tolerance
-
-            def at_null(null: Tensor, e: Effect = effect, x: Tensor = without) -> Any:
-                if e.hook == "noise":
-                    return applied(e, x, null, action, context)
-                return self._seeded(theta, replace(rows, phi={e.name: null}))
-
-            difference = change_at_null(without, at_null, effect)
-            if difference > allowed:
-                raise ValueError(
-                    f"expected effect {effect.name!r} to vanish at its null "
-                    f"{effect.null}; got {changed} changed by up to "
-                    f"{difference:.3g}; correct apply or null"
-                )
+                changed, without, size = "the noise", one, 1.0
+            difference = torch.inf
+            for null in nulls(effect, x):
+                own = replace(rows, phi={effect.name: null})
+                at_null = self._through("noise", one, own)
+                if effect.hook != "noise":
+                    at_null = self._seeded(theta, own)
+                difference = min(difference, largest_change(without, at_null))
+            require(
+                difference <= tolerance * size,
+                f"effect {effect.name!r} to vanish at its null {effect.null}",
+                f"{changed} changed by up to {difference:.3g}",
+                "correct apply or null",
+            )
             if effect.hook == "noise":
-                require_positive(effect, torch.ones_like(x), action, context)
+                require_positive(effect, one, action, context)
         self._unchecked = []
 
     def _seeded(self, theta: Tensor, rows: _Rows) -> Tensor:
