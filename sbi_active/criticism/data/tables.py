@@ -339,8 +339,8 @@ def _note_scales(
 ) -> None:
     """Warn where some trials' numbers are larger by as much as another unit."""
     middle = [np.nanmedian(s) if np.isfinite(s).any() else 0 for s in sizes]
-    known = pd.Series(middle, cells.names)
-    decades = np.log10(known[known > 0]).sort_values(kind="stable")
+    known: Any = pd.Series(middle, cells.names)
+    decades = known[known > 0].map(np.log10).sort_values(kind="stable")
     if len(decades) < 3:
         return
     k = int(np.argmax(np.diff(decades))) + 1

@@ -80,19 +80,13 @@ def settle(
         settling: When a verdict is settled.
 
     Raises:
-        ValueError: If there are no permitted actions, x is compared by summaries, or
-            the folder belongs to other trials.
+        ValueError: If there are no permitted actions, or the folder belongs to other
+            trials.
         VerdictError: If the comparison fails after a trial was run.
     """
     first = compare(trials)
     expected = "the permitted actions with real_system"
     require(first.actions is not None, expected, None, "pass actions=")
-    require(
-        not first.num_summaries,
-        "all numbers of x with real_system, whose outcome is predicted",
-        f"{first.num_summaries} summaries",
-        "pass summaries=0",
-    )
     journal = Journal(directory)
     journal.begin(digest=first.digest, num_trials=len(trials))
     tested = journal.tested()

@@ -170,17 +170,11 @@ def _sizes_left(report: Contents) -> dict[str, Any]:
 
 def _groups(report: Contents) -> list[tuple[frozenset[str], str]]:
     """Return the groups of models that nothing separates, or not these trials."""
-    tracing, aliases = report.tracing, list[frozenset[str]]()
-    for pair in tracing.aliases:  # pairs with names in common are one group
-        touching = [group for group in aliases if group & pair]
-        aliases = [group for group in aliases if group not in touching]
-        aliases.append(pair.union(*touching))
+    tracing = report.tracing
     near = [group for group in tracing.near if group not in tracing.equivalent]
     why = {
         "no permitted action separates them": tracing.equivalent,
         "not separated by these trials; another action may": near,
-        "nearly the same here, apart by less than the noise; repeated trials may "
-        "separate them": aliases,
     }
     return [(group, said) for said, groups in why.items() for group in groups]
 

@@ -58,7 +58,6 @@ def test_parameters_beside_an_effect_without_a_null_are_looked_for_anew():
         Trials(action, x, index=index),
         effects=EFFECTS,
         seed=0,
-        summaries=0,
     )
     sensor = sensor_of(loop.rivals)
     search = Search(loop.rivals, sensor)
