@@ -13,9 +13,9 @@ from sbi_active.criticism.report.summary import (
     NO_PART,
     added,
     label,
-    limits,
     narrow_prior,
     not_told_from,
+    rests,
     sizes,
     suspects_in_words,
     verdict_in_words,
@@ -88,7 +88,7 @@ def _prose(report: Contents, *, sections: bool = True) -> list[str]:
     values: dict[str, Any] = {
         "verdict": verdict_in_words(report),
         "likelier": _likelier(report),
-        "limits": limits(tracing),
+        "rests": rests(tracing) if tracing.needed else "",
         "needs_none": report.verdict != NONE
         and tracing.bounds.p_value > LEVEL
         and not tracing.bounds.replaces,
