@@ -185,18 +185,16 @@ def require_covered(
         stamps: Times of the inputs, by name, shape (t, m).
         names: Names of the trials.
     """
-    for name, times in stamps.items():
-        for i, row in enumerate(x_times):
-            known = times[i][times[i].isfinite()]
-            first, last = float(known.min()), float(known.max())
-            step = float(known.diff().median()) if len(known) > 1 else 0.0
+    for name, own in stamps.items():
+        for trial, row, times in zip(names, x_times, own, strict=True):
+            known = times[times.isfinite()].numpy()
+            steps, (first, last) = np.diff(known), (known.min(), known.max())
+            step = np.median(steps) if len(steps) else 0.0
             slack = max(GAP * step, FAR * (last - first))
-            own = row[row.isfinite()]
-            far = own[(own < first - slack) | (own > last + slack)]
-            if len(far):
+            for far in row[(row < first - slack) | (row > last + slack)][:1].tolist():
                 raise ValueError(
-                    f"expected x of trial {names[i]} measured within the time of its "
-                    f"input {name!r}, {first:g} to {last:g}; got x at {far[0]:g}; give "
+                    f"expected x of trial {trial} measured within the time of its "
+                    f"input {name!r}, {first:g} to {last:g}; got x at {far:g}; give "
                     "both in one unit and from one origin, or leave out what is beyond"
                 )
 

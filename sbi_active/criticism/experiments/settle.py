@@ -172,8 +172,6 @@ def _verdict(
 
 
 NAME = "trials.jsonl"
-#: Fields of a prediction that are arrays.
-ARRAYS = ("action", "mean", "sd", "position", "bare")
 
 
 class Journal:
@@ -197,9 +195,8 @@ class Journal:
         if self.path is None:
             return
         self.path.parent.mkdir(parents=True, exist_ok=True)
-        line = json.dumps(
-            {"event": event, **parts}, default=operator.methodcaller("tolist")
-        )
+        said = {"event": event, **parts}
+        line = json.dumps(said, default=operator.methodcaller("tolist"))
         with self.path.open("a", encoding="utf-8") as file:
             file.write(f"{line}\n")
             file.flush()
@@ -215,11 +212,11 @@ class Journal:
             ValueError: If the folder belongs to other trials or another library.
         """
         if not self.events:
-            return self.write("begun", **about)
+            self.write("begun", **about)
+            return
         own = {name: self.events[0].get(name) for name in about}
         advice = "pass what it was begun with, or another directory"
         require(own == about, f"the trials of {self.path}, {own}", about, advice)
-        return None
 
     def tested(self) -> list[TestedTrial]:
         """Return the trials that were measured, each with its prediction."""
@@ -239,9 +236,9 @@ class Journal:
 
 
 def _registered(event: dict[str, Any]) -> Registered:
-    parts = {f.name: event[f.name] for f in fields(Registered)}
-    arrays: dict[str, Any] = {name: np.asarray(parts[name]) for name in ARRAYS}
-    return Registered(**{**parts, **arrays})
+    own = {f.name: event[f.name] for f in fields(Registered)}
+    arrays = {k: np.asarray(v) for k, v in own.items() if isinstance(v, list)}
+    return Registered(**{**own, **arrays})
 
 
 def _read(path: Path) -> list[dict[str, Any]]:

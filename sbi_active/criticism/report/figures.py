@@ -54,7 +54,7 @@ def plot_residuals(
     before: Residuals,
     after: Residuals | None = None,
     *,
-    action_labels: Sequence[str] | None = None,
+    action_labels: Sequence[str] = (),
     channel_names: Sequence[str] | None = None,
     added: str = "the effect",
 ) -> Figure:
@@ -78,18 +78,15 @@ def plot_residuals(
     rows = [(before, "bare model", BEFORE)]
     if after is not None:
         rows.append((after, f"with {added}", AFTER))
-    labels = action_labels
-    if labels is None:
-        labels = [f"action {i + 1}" for i in range(before.action.shape[1])]
-    shown = min(len(labels), 3)
+    shown = min(len(action_labels), 3)
     several = before.x[0].size > 1
     columns = shown + 1 + several
     figure, axes = _subplots(len(rows), columns, width=3.3, height=2.5)
     for line, (residuals, title, color) in zip(axes, rows, strict=True):
-        each = _entries(residuals.refitted)
+        each = residuals.refitted.reshape(len(residuals.index), -1)
         for i in range(shown):
             _scatter(line[i], residuals.action[:, i], each, color)
-            line[i].set_xlabel(labels[i])
+            line[i].set_xlabel(action_labels[i])
         _scatter(line[shown], residuals.index, each, color)
         _trial_axis(line[shown], residuals)
         if several:
@@ -171,7 +168,7 @@ def _by_entry(
     ax: Axes, residuals: Residuals, color: str, channel_names: Sequence[str] | None
 ) -> None:
     """Draw one line a trial over time, or points over the channels."""
-    each = _entries(residuals.refitted)
+    each = residuals.refitted.reshape(len(residuals.index), -1)
     if residuals.times is not None:
         length = residuals.x.shape[1]
         times = np.broadcast_to(residuals.times, (len(each), length))
@@ -225,10 +222,6 @@ def _plain(ax: Axes) -> None:
     ax.tick_params(labelsize=8)
     ax.xaxis.label.set_fontsize(9)  # type: ignore[attr-defined]  # by its alias
     ax.yaxis.label.set_fontsize(9)  # type: ignore[attr-defined]
-
-
-def _entries(z: Array) -> Array:
-    return z.reshape(len(z), -1)
 
 
 def _subplots(

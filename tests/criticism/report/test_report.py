@@ -167,7 +167,7 @@ def rows_in_order(rows):
 @pytest.mark.parametrize("shape", [(1,), (6,)])
 def test_every_residual_is_drawn_at_its_action_its_trial_and_its_channel(shape):
     before, after = residuals(shape, size=4.0), residuals(shape)
-    figure = plot_residuals(before, after, added="a gain")
+    figure = plot_residuals(before, after, action_labels=["speed"], added="a gain")
     columns = 2 if shape == (1,) else 3
     assert len(figure.axes) == 2 * columns
     for row, (made, color, title) in enumerate(
