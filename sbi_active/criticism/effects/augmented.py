@@ -38,6 +38,10 @@ class _Rows:
     action: Tensor
     context: Context
 
+    def at(self, some: slice) -> _Rows:
+        """Return some rows, without effects."""
+        return _Rows({}, self.action[some], self.context.at(some))
+
 
 class AugmentedSimulator(SimulatorModel):
     r"""A simulator whose parameters are :math:`(\theta, \phi)`.
@@ -103,8 +107,8 @@ class AugmentedSimulator(SimulatorModel):
         if check is not None and self._unchecked:
             known = sum(e.phi_dim for e in before if e.scope == "campaign")
             theta, action, *own = check
-            context = self._row_context(action, given=own[0] if own else None)
-            self._check_null(theta[:, : theta.shape[1] - known], action, context)
+            rows = self._rows({}, action, context=own[0] if own else None)
+            self._check_null(theta[:, : theta.shape[1] - known], rows)
 
     @property
     @override
@@ -147,10 +151,10 @@ class AugmentedSimulator(SimulatorModel):
         Returns:
             Shape (n, *x_shape).
         """
-        context = self._row_context(action, index, context)
-        self._check_first(theta, action, context)
+        rows = self._rows(phi, action, index, context)
+        self._check_first(theta, rows)
         merge = merge and self.noise is not None  # a draw is another at each call
-        return self._evaluate(theta, _Rows(phi, action, context), seeds, merge=merge)
+        return self._evaluate(theta, rows, seeds, merge=merge)
 
     def noise_scale(
         self,
@@ -170,8 +174,7 @@ class AugmentedSimulator(SimulatorModel):
             index: Place of each row's trial, as in :meth:`evaluate`.
             context: Context of the rows, as in :meth:`evaluate`.
         """
-        context = self._row_context(action, index, context)
-        return self._through("noise", sd, _Rows(phi, action, context))
+        return self._through("noise", sd, self._rows(phi, action, index, context))
 
     def split(self, parameters: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
         """Return theta and phi by effect from (theta, phi), shape (n, dim)."""
@@ -210,15 +213,11 @@ class AugmentedSimulator(SimulatorModel):
         drawn: dict[str, Tensor] | None = None,
     ) -> Tensor:
         theta, phi = self.split(torch.as_tensor(theta))
-        phi |= drawn or {}
-        action = torch.as_tensor(action)
         told = {name: effects[name] for name in CONDITIONS if name in effects}
         rest = {name: value for name, value in effects.items() if name not in told}
-        context = self._row_context(action)
-        if told:
-            context = self._row_context(action, given=replace(context, **told))
-        self._check_first(theta, action, context)
-        return self._evaluate(theta, _Rows(phi, action, context), seeds, rest)
+        rows = self._rows(phi | (drawn or {}), torch.as_tensor(action), **told)
+        self._check_first(theta, rows)
+        return self._evaluate(theta, rows, seeds, rest)
 
     def _trial_draws(
         self, num: int, dtype: torch.dtype, seeds: Tensor | None
@@ -236,23 +235,27 @@ class AugmentedSimulator(SimulatorModel):
         draws = torch.cat(rows).to(dtype).split([e.phi_dim for e in trial], -1)
         return {e.name: d for e, d in zip(trial, draws, strict=True)}
 
-    def _row_context(
-        self, action: Tensor, index: Tensor | None = None, given: Context | None = None
-    ) -> Context:
-        """Return what effects may know of rows, of the type of their actions."""
-        if given is None:
-            if index is None:
-                index = torch.full((len(action),), float(self.next_index))
-            given = Context(index)
-        if given.times is None:
-            given = replace(given, times=self._times)
-        return Context(**{k: typed(v, action.dtype) for k, v in vars(given).items()})
+    def _rows(
+        self,
+        phi: dict[str, Tensor],
+        action: Tensor,
+        index: Tensor | None = None,
+        context: Context | None = None,
+        **told: Any,
+    ) -> _Rows:
+        """Return rows with what effects may know of them, of the type of actions."""
+        if index is None:
+            index = torch.full((len(action),), float(self.next_index))
+        known = vars(context or Context(index)) | told
+        if known["times"] is None:
+            known["times"] = self._times
+        return _Rows(phi, action, Context(**typed(known, action.dtype)))
 
-    def _check_first(self, theta: Tensor, action: Tensor, context: Context) -> None:
+    def _check_first(self, theta: Tensor, rows: _Rows) -> None:
         """Compare effects that were not yet with the simulator on a few rows."""
         few = slice(NUM_FIRST)
         if self._unchecked and len(theta):
-            self._check_null(theta[few], action[few], context.at(few))
+            self._check_null(theta[few], rows.at(few))
 
     def _active(self, hook: str, phi: dict[str, Tensor]) -> list[Effect]:
         return [e for e in self.effects if e.hook == hook and e.name in phi]
@@ -324,18 +327,17 @@ class AugmentedSimulator(SimulatorModel):
         )
         return x[place]
 
-    def _check_null(self, theta: Tensor, action: Tensor, context: Context) -> None:
+    def _check_null(self, theta: Tensor, rows: _Rows) -> None:
         """Raise if an effect at its null changes x.
 
         It may do so by single precision, with room for a formula's rounding.
         """
         tolerance = 1e-4  # in deviations of x over the checked rows
-        rows = _Rows({}, action, context)
         x = self._seeded(theta, rows)
-        shapes = [x.shape, *(u.shape for u in (context.inputs or {}).values())]
+        shapes = [x.shape, *(u.shape for u in (rows.context.inputs or {}).values())]
         if any(len(x) in shape[1:] for shape in shapes) and len(x) > 1:
             # As many rows as entries hide phi that is spread over the wrong axis.
-            self._check_null(theta[:-1], action[:-1], context.at(slice(-1)))
+            self._check_null(theta[:-1], rows.at(slice(-1)))
             return
         finite, one = x[x.isfinite()].double(), torch.ones_like(x)
         spread = float(finite.std()) if len(finite) > 1 else 0.0
@@ -358,7 +360,7 @@ class AugmentedSimulator(SimulatorModel):
                 "correct apply or null",
             )
             if effect.hook == "noise":
-                require_positive(effect, one, action, context)
+                require_positive(effect, one, rows.action, rows.context)
         self._unchecked = []
 
     def _seeded(self, theta: Tensor, rows: _Rows) -> Tensor:
