@@ -30,6 +30,7 @@ from sbi_active.arrays import Array
 from sbi_active.callers import stack_level
 from sbi_active.criticism.data.arrays import repeated
 from sbi_active.criticism.data.trials import Trials
+from sbi_active.criticism.effects.changes import Wrapped
 from sbi_active.criticism.effects.effect import Context, Effect, Hook
 from sbi_active.expected import require
 from sbi_active.messages import warn
@@ -155,8 +156,10 @@ def zero_from_first_samples(
     each = [(channel, 0) for channel in channels]
     values, errors, _ = _fitted(trials, each, 0, within, sd)
     copy = trials.select(slice(None))
-    copy.x = _Offset((*channels,))(trials.x, torch.from_numpy(-values))
-    return copy, _nuisance(name, "observation", _Offset((*channels,)), width * errors)
+    offset = Wrapped("offset", channel=None if copy.x.ndim == 2 else (*channels,))
+    zero = torch.from_numpy(-values).to(copy.x.dtype)
+    copy.x = offset(copy.x, zero, copy.action, Context(copy.index))
+    return copy, _nuisance(name, "observation", offset, width * errors)
 
 
 @dataclass(frozen=True)
@@ -173,22 +176,6 @@ class _Shifted:
             return value
         own = dict(zip(self.names, phi.unbind(-1), strict=True))
         return {**value, "start": {k: v + own.get(k, 0) for k, v in start.items()}}
-
-
-@dataclass(frozen=True)
-class _Offset:
-    """Adds phi to some entries of x."""
-
-    channels: tuple[int, ...]
-
-    def __call__(
-        self, value: Tensor, phi: Tensor, action: Any = None, context: Any = None
-    ) -> Tensor:
-        if value.ndim == 2:
-            return value + phi.to(value.dtype)
-        offset = torch.zeros_like(value)
-        offset[..., list(self.channels)] = phi.to(value.dtype)[:, None]
-        return value + offset
 
 
 def _nuisance(name: str, hook: Hook, apply: Any, deviations: Array) -> Effect:
