@@ -5,7 +5,6 @@ from __future__ import annotations
 import copy
 import hashlib
 from collections.abc import Sequence
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -42,14 +41,14 @@ def with_noise(
     fewest_repeats: int = 3,
 ) -> SimulatorModel:
     """Return the model with noise from repeats where it is deterministic without."""
-    theta, action = _some_rows(prior, trials)
-    run = _conditions(model, trials, theta)
+    theta, action, at = _some_rows(prior, trials)
+    run = conditions_for(model, trials, at, theta.dtype)
     if model.noise is not None or not model.is_deterministic(theta, action, **run):
         return model
     fit = trials.fit
     first = torch.where(fit.repeat_of < 0, torch.arange(len(fit)), fit.repeat_of)
     groups = [fit.x[first == i] for i in first.unique()]
-    most = max(len(group) for group in groups)
+    most = max(map(len, groups))
     require(
         most >= fewest_repeats,
         "measurement noise, declared or estimated from at least "
@@ -58,12 +57,10 @@ def with_noise(
         "action, so that nothing tells noise from effect",
         "declare SimulatorModel(fn, noise=...)",
     )
-    repeated = [group for group in groups if len(group) > 1]
     noisy = copy.copy(model)
-    has_time = model.sample_times is not None
     noisy.noise = estimate_noise(
-        repeated,
-        kind="autocorrelated" if has_time else "gaussian",
+        [group for group in groups if len(group) > 1],
+        kind="gaussian" if model.sample_times is None else "autocorrelated",
         times=model.sample_times,
         pooled=True,
     )
@@ -138,14 +135,13 @@ def require_fitting(
         times, grid = model.sample_times, trials.input_times
         assert times is not None
         assert grid is not None
-        require_covered(
-            times[None], dict.fromkeys(trials.inputs, grid[None]), trials.names
-        )
+        stamps = dict.fromkeys(trials.inputs, grid[None])
+        require_covered(times[None], stamps, trials.names)
     if actions is not None:
         _warn_outside(trials, actions)
-    theta, action = _some_rows(prior, trials)
+    theta, action, at = _some_rows(prior, trials)
     if model.noise is not None:
-        x = model.mean(theta, action, **_conditions(model, trials, theta))
+        x = model.mean(theta, action, **conditions_for(model, trials, at, theta.dtype))
         require(
             bool(x.isfinite().any()),
             "a simulator that gives numbers at the trials' actions",
@@ -153,7 +149,7 @@ def require_fitting(
             "check its units and those of the actions",
         )
     # Compares every effect with the simulator at its null.
-    context = conditions_of_trials(trials, _some_trials(trials), model)
+    context = conditions_of_trials(trials, at, model)
     AugmentedSimulator(model, effects, check=(theta, action, context))
 
 
@@ -176,13 +172,11 @@ def require_warm_up(warm_up: float, trials: Trials, effects: Sequence[Effect]) -
         "warm_up out",
     )
     times = trials.sample_times
-    if times is None:
-        raise ValueError(
-            f"expected sample_times with warm_up; got {given} and none; give "
-            "Trials(sample_times=...)"
-        )
-    stamps = times.expand(len(trials), -1).nan_to_num(-torch.inf)
-    span = stamps.amax(1) - times.expand(len(trials), -1)[:, 0]
+    advice = "give Trials(sample_times=...)"
+    expected, got = "sample_times with warm_up", f"{given} and none"
+    require(times is not None, expected, got, advice)
+    stamps = torch.as_tensor(times).expand(len(trials), -1)
+    span = stamps.nan_to_num(-torch.inf).amax(1) - stamps[:, 0]
     for name, own in zip(trials.names, span.tolist(), strict=True):
         expected, got = f"trials longer than {given}", f"{own:g} in trial {name}"
         advice = "pass a shorter warm_up, in the unit of the sample times"
@@ -205,22 +199,13 @@ def _warn_outside(trials: Trials, actions: ActionSpace) -> None:
     )
 
 
-def _conditions(model: SimulatorModel, trials: Trials, theta: Tensor) -> dict[str, Any]:
-    """Return how some trials were run, as far as the model's function takes it."""
-    return conditions_for(model, trials, _some_trials(trials), theta.dtype)
-
-
-def _some_trials(trials: Trials) -> Tensor:
-    """Return positions of trials for a few rows, shape (16,), none with padding."""
+def _some_rows(prior: Distribution, trials: Trials) -> tuple[Tensor, Tensor, Tensor]:
+    """Return parameters, actions, and positions of these trials, none with padding."""
     whole = torch.arange(len(trials))
     if trials.sample_times is not None:
-        times = trials.sample_times.expand(len(trials), -1)
-        sampled = times.isfinite().sum(1)
+        sampled = trials.sample_times.expand(len(trials), -1).isfinite().sum(1)
         whole = whole[sampled == sampled.max()]
-    return whole[torch.arange(NUM_CHECKED) % len(whole)]
-
-
-def _some_rows(prior: Distribution, trials: Trials) -> tuple[Tensor, Tensor]:
+    at = whole[torch.arange(NUM_CHECKED) % len(whole)]
     with forked_generators(0, "check"):
-        theta = prior.sample((NUM_CHECKED,))  # type: ignore[arg-type]
-    return theta, trials.action[_some_trials(trials)].to(theta.dtype)
+        theta = prior.sample(torch.Size([NUM_CHECKED]))
+    return theta, trials.action[at].to(theta.dtype), at

@@ -23,7 +23,6 @@ from sbi_active.criticism.data.trials import Trials
 from sbi_active.criticism.effects.augmented import AugmentedSimulator
 from sbi_active.criticism.effects.effect import Effect
 from sbi_active.criticism.effects.joint_prior import joint_prior
-from sbi_active.criticism.effects.summaries import MANY, MOST, obstacle, summarize
 from sbi_active.criticism.evidence.rival_set import RivalSet
 from sbi_active.criticism.linear.screening import linear_models
 from sbi_active.criticism.misfit.contrary import judged, widened
@@ -45,7 +44,6 @@ from sbi_active.criticism.steps.predictive import NUM_DRAWS, find_residuals
 from sbi_active.criticism.thinning import thinned_to_need
 from sbi_active.expected import suggests
 from sbi_active.progress import stage
-from sbi_active.seeding import derive_seed
 from sbi_active.simulation import SimulatorModel
 
 if TYPE_CHECKING:
@@ -71,9 +69,6 @@ class Criticism:
         effects: Effects that the simulator may lack. Those of the order of the trials
             are left out if the order is unknown.
         actions: Permitted actions; None takes those of the trials.
-        summaries: Number of summaries of x to compare instead of all its numbers, at
-            most; 0 for none. None takes 20 if a trial has more than 500 numbers without
-            a time axis, with independent noise.
         warm_up: Time from its first sample, in the unit of the sample times, in which a
             held-out or left-out trial tells of its nuisances (effects of scope
             "trial"), and is not scored; 0 draws them from their priors.
@@ -116,7 +111,6 @@ class Criticism:
         *,
         effects: Sequence[Effect] = (),
         actions: Actions | None = None,
-        summaries: int | None = None,
         warm_up: float = 0.0,
         thin: bool = True,
         rule: Rule = Rule(),  # noqa: B008  (frozen)
@@ -138,23 +132,10 @@ class Criticism:
         #: Sampling of the trajectories; None if not looked for.
         self.sampling: Sampling | None = None
         self._parts = model, trials, self.effects
-        if summaries is None:
-            many = trials.x[0].numel() > MANY and not obstacle(*self._parts)
-            summaries = MOST if many else 0
-        #: Number of summaries that are compared in place of x; 0 for all its numbers.
-        self.num_summaries = summaries
-        if summaries:
-            short = summarize(
-                *(model, prior, trials, self.effects),
-                num=summaries,
-                seed=derive_seed(seed, "summaries"),
-            )
-            self._parts = short.model, short.trials, short.effects
-            self.num_summaries = len(short.weight)
         self._warm_up = require_warm_up(warm_up, *self._parts[1:])
         #: Trials that every model misses by far more than the others.
         self.set_aside: tuple[OutlyingTrial, ...] = ()
-        self._look(thins=thin and not summaries)
+        self._look(thins=thin)
         #: Hash of the noise, the effects and all priors, as they were declared.
         self.digest = digest(model, prior, self.effects)
 
@@ -269,7 +250,7 @@ class Criticism:
                 f"expected effects among {', '.join(known.effects) or 'none'}; "
                 f"got {', '.join(sorted(lost))}; declare them in Criticism(effects=...)"
             )
-        declared = {e.name: e for e in self.effects}  # acting on x, not its summaries
+        declared = {e.name: e for e in self.effects}
         every = (*names, *[e.name for e in known.nuisances])
         if not (added := [declared[n] for n in every]):
             return self.model, self.prior
@@ -349,7 +330,7 @@ class Criticism:
             exploratory: Whether library or priors were changed after the data were
                 seen; the report then warns of it.
         """
-        from sbi_active.criticism.reporting import report_of
+        from sbi_active.criticism.report.report import report_of
 
         evaluation = self.evaluate() if evaluate else None
         own = self, evaluation, self._parts[1].held_out

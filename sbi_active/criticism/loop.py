@@ -33,7 +33,6 @@ def close_loop(  # noqa: D417  (the rest are those of Criticism)
     real_system: Callable[[Tensor], Any] | None = None,
     max_trials: int = 3,
     directory: str | Path | None = None,
-    summaries: int | None = None,
     warm_up: float = 0.0,
     thin: bool = True,
     rule: Rule = Rule(),  # noqa: B008  (frozen)
@@ -67,7 +66,6 @@ def close_loop(  # noqa: D417  (the rest are those of Criticism)
             measured,
             effects=effects,
             actions=actions,
-            summaries=summaries,
             warm_up=warm_up,
             thin=thin,
             rule=rule,

@@ -351,11 +351,6 @@ class NextAction:
         outside_separates: The group that it separates; empty without.
         outside_gain: Lower bound on the information about which of the group is right,
             all taken as equally likely, nats; 0 without.
-        within: Action, where several forms of a force are left, within the range of the
-            trials that tells most about which, shape (action_dim,).
-        within_gain: Lower bound on that information, nats.
-        beyond: Action that tells most beyond that range, permitted or not.
-        beyond_gain: Lower bound on that information, nats.
     """
 
     action: Array | None
@@ -366,7 +361,3 @@ class NextAction:
     outside: Array | None = None
     outside_separates: tuple[str, ...] = ()
     outside_gain: float = 0.0
-    within: Array | None = None
-    within_gain: float = 0.0
-    beyond: Array | None = None
-    beyond_gain: float = 0.0

@@ -9,7 +9,6 @@ from sbi_active.criticism.data.trials import Trials
 from sbi_active.criticism.evidence.rival_set import RivalSet
 from sbi_active.criticism.linear.fits import sensor_of
 from sbi_active.criticism.linear.search import Search
-from sbi_active.criticism.report.words import caution
 from sbi_active.criticism.results import ModelKey
 from sbi_active.criticism.rivals.noise_grid import measurement_sds
 
@@ -44,9 +43,3 @@ def thinned_to_need(rivals: RivalSet, trials: Trials) -> tuple[Trials, Sampling 
     if sampling.every == 1:
         return trials, sampling
     return thinned(trials, sampling, trials.sample_times if own else times), sampling
-
-
-def in_words(found: Sampling) -> str:
-    """Return a text on the samples that were left out, and why."""
-    rates = 1 / found.step, found.every, 1 / found.suggested_step
-    return caution("SA525", *rates, found)

@@ -7,7 +7,7 @@ from torch.distributions import Independent, Normal
 
 from sbi_active import DiscreteActions, GaussianNoise, SimulatorModel, StudentTNoise
 from sbi_active.criticism import Criticism, Effect, Trials, close_loop
-from sbi_active.criticism.report.summary import suspects
+from sbi_active.criticism.steps.tracing import credible_set
 from tests.criticism.report.reports import flat, report
 
 PRIOR = BoxUniform(-5 * torch.ones(2), 5 * torch.ones(2))
@@ -48,7 +48,7 @@ def test_a_gross_error_is_named_by_the_trial_s_own_index(size):
     found = loop.trace()
     assert found.verdict == "outlier"
     assert found.chosen == ()
-    assert suspects(found) == (18.0,)
+    assert credible_set(found.outliers) == (18.0,)
     assert sum(found.probabilities.values()) == pytest.approx(1.0)
     made = loop.report(evaluate=False, plan=False)
     assert str(made).startswith("Verdict: outlier (P ")
@@ -76,7 +76,7 @@ def test_a_slip_along_a_trajectory_is_an_outlier_and_no_process(num, wrong):
     trials = Trials(xi, x, sample_times=times)
     found = Criticism(model, PRIOR, trials).trace()
     assert found.verdict == "outlier"
-    assert suspects(found) == (float(wrong),)
+    assert credible_set(found.outliers) == (float(wrong),)
 
 
 @pytest.mark.parametrize("wrong", [-1e30, "unit"])
@@ -88,7 +88,7 @@ def test_what_nothing_explains_ends_no_loop(wrong):
         MODEL, PRIOR, trials, effects=[QUADRATIC], evaluate=False, plan=False
     )
     assert made.verdict == "outlier"
-    assert suspects(made.tracing) == (2.0,)
+    assert credible_set(made.tracing.outliers) == (2.0,)
 
 
 def test_a_true_effect_stays_named_beside_the_outlier():
@@ -106,7 +106,7 @@ def test_an_effect_for_which_one_doubtful_trial_speaks_is_not_named():
     x[7] += 9.0
     found = criticism(x, xi=xi).trace()
     assert found.verdict == "outlier"
-    assert suspects(found) == (7.0,)
+    assert credible_set(found.outliers) == (7.0,)
     assert 7.0 in found.needed or not found.instead_of
 
 

@@ -45,10 +45,11 @@ class Cells:
         columns: Mapping[str, Sequence[Column]],
         source: str,
     ) -> None:
-        self.frame = pd.concat(parts.values(), ignore_index=True)
+        numbered = {file: part.reset_index(drop=True) for file, part in parts.items()}
+        whole = pd.concat(numbered)
+        self._places = [*whole.index]  # file, and row in it
+        self.frame = whole.reset_index(drop=True)
         self.columns, self.source = columns, source
-        self._files = [*parts]
-        self._begin = np.cumsum([0, *map(len, parts.values())])[:-1]
         self.is_long, self.is_named = bool(columns[TIME]), bool(columns[TRIAL])
         num = len(self.frame)
         # Without names a row is a trial, or all rows are one series.
@@ -87,20 +88,17 @@ class Cells:
         else:
             time = self.numbers(column)
         for at in self.members:
-            order = at[np.argsort(time[at], kind="stable")]
-            for k in np.flatnonzero(np.diff(time[order]) == 0):
-                one, two = sorted(order[k : k + 2])
+            for k in np.flatnonzero(np.diff(time[at]) <= 0):
+                one, two = at[k], at[k + 1]
+                expected, advice = "times that increase within a trial", "sort its rows"
+                again = f"{time[two]:g} s in "
+                if time[one] == time[two]:
+                    expected, advice, again = "each sample once", "remove one", ""
+                where = f"{self.place(two)} of {self.file(two)}"
                 raise ValueError(
-                    f"expected each sample once; got {column.header} = {time[one]:g} s "
-                    f"in {self.row(one)} and {self.place(two)} of {self.file(two)}; "
-                    "remove one, or give each trial its own name"
-                )
-            for k in np.flatnonzero(np.diff(time[at]) < 0):
-                raise ValueError(
-                    "expected times that increase within a trial; got "
-                    f"{time[at[k + 1]]:g} s in {self.place(at[k + 1])} after "
-                    f"{time[at[k]]:g} s in {self.row(at[k])} of {self.file(at[k])}; "
-                    "sort its rows, or give each trial its own name"
+                    f"expected {expected}; got {column.header} = {time[one]:g} s in "
+                    f"{self.row(one)} and {again}{where}; {advice}, or give each trial "
+                    "its own name"
                 )
         return time
 
@@ -147,20 +145,16 @@ class Cells:
 
     def row(self, i: Any) -> str:
         """Return the number of a row in its file, in words."""
-        return f"row {i - self._begin[self._part(i)] + 1}"
+        return f"row {self._places[i][1] + 1}"
 
     def place(self, i: Any) -> str:
         """Return the number of a row with the name of its trial, in words."""
-        return self.row(i) + (
-            f" (trial {self.names[self.trial[i]]})" if self.is_named else ""
-        )
+        name = f" (trial {self.names[self.trial[i]]})" if self.is_named else ""
+        return self.row(i) + name
 
     def file(self, i: Any) -> str:
         """Return the file in which a row stands."""
-        return self._files[self._part(i)]
-
-    def _part(self, i: Any) -> int:
-        return int(np.searchsorted(self._begin, i, side="right")) - 1
+        return self._places[i][0]
 
 
 def _digits(value: float) -> str:

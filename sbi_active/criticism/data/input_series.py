@@ -185,18 +185,16 @@ def require_covered(
         stamps: Times of the inputs, by name, shape (t, m).
         names: Names of the trials.
     """
-    for name, times in stamps.items():
-        for i, row in enumerate(x_times):
-            known = times[i][times[i].isfinite()]
-            first, last = float(known.min()), float(known.max())
-            step = float(known.diff().median()) if len(known) > 1 else 0.0
+    for name, own in stamps.items():
+        for trial, row, times in zip(names, x_times, own, strict=True):
+            known = times[times.isfinite()].numpy()
+            steps, (first, last) = np.diff(known), (known.min(), known.max())
+            step = np.median(steps) if len(steps) else 0.0
             slack = max(GAP * step, FAR * (last - first))
-            own = row[row.isfinite()]
-            far = own[(own < first - slack) | (own > last + slack)]
-            if len(far):
+            for far in row[(row < first - slack) | (row > last + slack)][:1].tolist():
                 raise ValueError(
-                    f"expected x of trial {names[i]} measured within the time of its "
-                    f"input {name!r}, {first:g} to {last:g}; got x at {far[0]:g}; give "
+                    f"expected x of trial {trial} measured within the time of its "
+                    f"input {name!r}, {first:g} to {last:g}; got x at {far:g}; give "
                     "both in one unit and from one origin, or leave out what is beyond"
                 )
 
@@ -204,23 +202,17 @@ def require_covered(
 def _stamps(series: Mapping[str, Tensor], times: Any) -> dict[str, Tensor]:
     """Return the times of each input's values, shape (t, m)."""
     of = times if isinstance(times, Mapping) else dict.fromkeys(series, times)
-    require(
-        {*of} == {*series},
-        f"input_times of {', '.join(series)}",
-        f"those of {', '.join(map(str, of)) or 'none'}",
-        "give each input its own, or one array for all",
-    )
+    expected, got = ", ".join(series), ", ".join(map(str, of)) or "none"
+    advice = "give each input its own, or one array for all"
+    require({*of} == {*series}, f"input_times of {expected}", f"those of {got}", advice)
     found = {}
     for name, value in series.items():
         own = padded(of[name])
         found[name] = own.expand(len(value), -1) if own.ndim == 1 else own
-        require(
-            found[name].shape == value.shape,
-            f"input_times of shape ({value.shape[1]},) or {tuple(value.shape)} for "
-            f"input {name!r}",
-            tuple(own.shape),
-            "give one time a value",
-        )
+        shapes = f"({value.shape[1]},) or {tuple(value.shape)}"
+        expected = f"input_times of shape {shapes} for input {name!r}"
+        same = found[name].shape == value.shape
+        require(same, expected, tuple(own.shape), "give one time a value")
     return found
 
 
@@ -234,27 +226,26 @@ def _piece(what: str, values: Tensor, times: Tensor) -> Piece:
                 f"expected a {name} of each value; got {got} for {what}, value {k}; "
                 "fill it in"
             )
-    steps = times[:length].diff()
-    middle = float(steps.median()) if len(steps) else 0.0
-    for (k,) in (steps <= 0).nonzero().tolist():
+    t, u = times[:length].numpy(), values[:last].numpy()
+    steps = np.diff(t)
+    middle = float(np.median(steps)) if len(steps) else 0.0
+    for k in np.flatnonzero(steps <= 0):
         raise ValueError(
-            f"expected input_times that increase; got {float(times[k + 1]):g} after "
-            f"{float(times[k]):g} for {what}, value {k + 1}; sort the values by time, "
-            "and give each trial its own times"
+            f"expected input_times that increase; got {t[k + 1]:g} after {t[k]:g} for "
+            f"{what}, value {k + 1}; sort the values by time, and give each trial its "
+            "own times"
         )
-    for (k,) in (steps > GAP * middle).nonzero().tolist():
+    for k in np.flatnonzero(steps > GAP * middle):
         raise ValueError(
-            f"expected inputs without gaps; got no value from {float(times[k]):g} to "
-            f"{float(times[k + 1]):g} for {what}, where the median step is "
-            f"{middle:g}; fill in what was commanded there, or split the trial"
+            f"expected inputs without gaps; got no value from {t[k]:g} to {t[k + 1]:g} "
+            f"for {what}, where the median step is {middle:g}; fill in what was "
+            "commanded there, or split the trial"
         )
-    require(
-        2 <= last <= length,
-        "two or more values, and the time of each",
-        f"{last} values and {length} times of {what}",
-        "pass what does not vary in time as the action, action_* in a table",
-    )
-    return times[:length].numpy(), values[:last].numpy()
+    got, advice = f"{last} values and {length} times of {what}", "action_* in a table"
+    advice = f"pass what does not vary in time as the action, {advice}"
+    is_series = 2 <= last <= length
+    require(is_series, "two or more values, and the time of each", got, advice)
+    return t, u
 
 
 def _grid(pieces: Mapping[str, Sequence[Piece]], names: Sequence[str]) -> Array:

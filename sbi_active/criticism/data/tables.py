@@ -30,7 +30,7 @@ from sbi_active.criticism.data.columns import (
 )
 from sbi_active.criticism.data.units import TIME, split
 from sbi_active.expected import require
-from sbi_active.messages import ChangedWarning, warn
+from sbi_active.messages import warn
 
 #: The one table of a folder, where there is such; others are then not trials.
 TABLE = "trials.csv"
@@ -86,21 +86,12 @@ def read_trials(
     own_inputs = ", ".join(column.header for column in found["input"])
     others = f"{own_inputs} in {source} and more beside"
     require(not (own_inputs and beside), "inputs in one table", others, "keep one")
-    is_long = bool(found[TRIAL] or found[TIME] or own_inputs)
-    set_by = ["action"] * (not (own_inputs or beside))
-    require_columns(found, [*[TRIAL, TIME] * is_long, *set_by, "x"], source)
+    needed = [TRIAL, TIME] if found[TRIAL] or found[TIME] or own_inputs else []
+    needed += [] if own_inputs or beside else ["action"]
+    require_columns(found, [*needed, "x"], source)
     for file, frame in parts.items():
         expected = "a header, and one row a trial or sample"
         require(len(frame) > 0, expected, f"no rows in {file}", "write them")
-    used = [column for group in found.values() for column in group]
-    converted = [c for c in used if c.factor != 1 and c not in found[TIME]]
-    if converted:  # the last version left them in their unit
-        warn(
-            f"SA703 {', '.join(f'{c.header} to {c.unit}' for c in converted)}: columns "
-            f"of {source} are now converted: let the simulator give these units",
-            ChangedWarning,
-            stacklevel=stack_level(),
-        )
     return _trials(Cells(parts, found, source), beside)
 
 
@@ -211,7 +202,13 @@ def _trials(cells: Cells, beside: Cells | None) -> dict[str, Any]:
         filled = np.asarray(np.isfinite(x).any(1))
         values = [cells.numbers(c, empty=True) for c in columns["input"]]
         given = np.asarray(np.isfinite(values).any(0))
-        _note_without_input(cells, np.flatnonzero(filled & ~given))
+        if len(lost := np.flatnonzero(filled & ~given)):
+            warn(
+                f"SA209 {len(lost)} rows of {cells.source} have a measurement and no "
+                f"input, the first in {cells.place(lost[0])}; there the input before "
+                "holds",
+                stacklevel=stack_level(),
+            )
         # Inputs may come more often than x: then a row without x is no sample.
         only = given & ~filled
         members = [at[~only[at]] if filled[at].any() else at for at in members]
@@ -223,11 +220,9 @@ def _trials(cells: Cells, beside: Cells | None) -> dict[str, Any]:
     if cells.is_long or not columns["index"]:
         _require_distinct(cells, action, samples)
     for t in np.flatnonzero(pd.Series(index).duplicated()):
-        one = first[np.flatnonzero(index == index[t])[0]]
-        raise ValueError(
-            f"expected each trial once; got index {index[t]:g} in rows {one + 1} and "
-            f"{first[t] + 1} of {cells.source}; {AGAIN}"
-        )
+        one, two = first[np.flatnonzero(index == index[t])[0]], first[t]
+        got = f"index {index[t]:g} in rows {one + 1} and {two + 1} of {cells.source}"
+        raise ValueError(f"expected each trial once; got {got}; {AGAIN}")
     found |= {
         "action": action if columns["action"] else None,
         "x": x,
@@ -315,16 +310,6 @@ def _positions(cells: Cells, repeated: Array, index: Array) -> list[int]:
     return [place[value] if value >= 0 else -1 for value in repeated]
 
 
-def _note_without_input(cells: Cells, lost: Array) -> None:
-    """Warn of rows with a measurement in which no input stands."""
-    if len(lost):
-        warn(
-            f"SA209 {len(lost)} rows of {cells.source} have a measurement and no "
-            f"input, the first in {cells.place(lost[0])}; there the input before holds",
-            stacklevel=stack_level(),
-        )
-
-
 def _note_empty(cells: Cells, x: Array, rows: Array) -> None:
     """Warn of what counts as not measured."""
     # Sensors that are read at times of their own leave each other's cells empty.
@@ -354,20 +339,17 @@ def _note_scales(
 ) -> None:
     """Warn where some trials' numbers are larger by as much as another unit."""
     middle = [np.nanmedian(s) if np.isfinite(s).any() else 0 for s in sizes]
-    some = np.flatnonzero(np.array(middle) > 0)
-    if len(some) < 3:
+    known: Any = pd.Series(middle, cells.names)
+    decades = known[known > 0].map(np.log10).sort_values(kind="stable")
+    if len(decades) < 3:
         return
-    decades = np.log10(np.array(middle)[some])
-    order = np.argsort(decades)
-    k = int(np.argmax(np.diff(decades[order]))) + 1
-    low, high = decades[order[:k]], decades[order[k:]]
-    if high[0] - low[-1] < gap or max(np.ptp(low), np.ptp(high)) > within:
+    k = int(np.argmax(np.diff(decades))) + 1
+    low, high = decades[:k], decades[k:]
+    if high.min() - low.max() < gap or max(map(np.ptp, (low, high))) > within:
         return
-    fewer, word = order[k:], "larger"
-    if len(low) < len(high):
-        fewer, word = order[:k], "smaller"
-    which = ", ".join(cells.names[some[i]] for i in sorted(fewer)[:SHOWN])
-    factor = 10 ** abs(np.median(high) - np.median(low))
+    fewer, word = (low, "smaller") if len(low) < len(high) else (high, "larger")
+    which = ", ".join([name for name in cells.names if name in fewer.index][:SHOWN])
+    factor = 10 ** (high.median() - low.median())
     warn(
         f"SA207 {header} of {'trials' if cells.is_named else 'rows'} {which} in "
         f"{cells.source} is about {factor:.0f} times {word} than that of the others: "

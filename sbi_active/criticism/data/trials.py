@@ -190,7 +190,7 @@ class Trials:
     @classmethod
     def from_csv(
         cls,
-        path: str | Path,
+        path: str | Path | pd.DataFrame,
         *,
         columns: Mapping[str, str | Sequence[str]] | None = None,
         units: Mapping[str, str] | None = None,
@@ -232,17 +232,12 @@ class Trials:
         return cls(**found, order=order, input_hold=input_hold)
 
     @classmethod
-    def from_dataframe(
-        cls,
-        frame: pd.DataFrame,
-        *,
-        columns: Mapping[str, str | Sequence[str]] | None = None,
-        units: Mapping[str, str] | None = None,
-        order: Order = "known",
-        inputs: str | Path | pd.DataFrame | None = None,
-        input_hold: Hold = "previous",
-    ) -> Trials:
+    def from_dataframe(cls, frame: pd.DataFrame, **options: Any) -> Trials:
         """Return the trials of a data frame, laid out as for :meth:`from_csv`.
+
+        Args:
+            frame: Table with one row a trial or one row a sample.
+            **options: Options of :meth:`from_csv`.
 
         Example:
             >>> columns = {"ball": ["a", "a", "b"], "t": [0, 1, 0], "h": [3.0, 2, 4]}
@@ -255,8 +250,7 @@ class Trials:
             >>> trials.x.shape, trials.channel_labels
             (torch.Size([2, 2]), ('h [m]',))
         """
-        found = read_trials(frame, columns=columns, units=units, inputs=inputs)
-        return cls(**found, order=order, input_hold=input_hold)
+        return cls.from_csv(frame, **options)
 
     def __len__(self) -> int:
         return len(self.x)

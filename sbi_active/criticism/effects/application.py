@@ -49,18 +49,17 @@ def applied(
     return _numbers(effect, value, changed, effect.hook)
 
 
-def change_at_null(reference: Tensor, at_null: Any, effect: Effect) -> float:
-    """Return the largest change of x at the null; inf if it turns into NaN."""
-    difference = torch.inf
-    is_finite = bool(effect.null_phi(1).isfinite().all())
-    for finite in (True,) if is_finite else (False, True):
-        null = effect.null_phi(len(reference), finite=finite).to(reference.dtype)
-        x = torch.as_tensor(at_null(null))
-        same = (x == reference) | (x.isnan() & reference.isnan())
-        gap = (x - reference).abs().where(~same, torch.zeros_like(reference))
-        if bool(gap.isfinite().all()):
-            difference = min(difference, float(gap.max()))
-    return difference
+def nulls(effect: Effect, like: Tensor) -> list[Tensor]:
+    """Return the null in each row; one that is infinite also by a large number."""
+    each = {False, not bool(effect.null_phi(1).isfinite().all())}
+    return [effect.null_phi(len(like), finite=f).to(like.dtype) for f in each]
+
+
+def largest_change(reference: Tensor, x: Tensor) -> float:
+    """Return the largest difference of x; inf if a number turns into NaN or back."""
+    same = (x == reference) | (x.isnan() & reference.isnan())
+    gap = (x - reference).abs().where(~same, torch.zeros_like(reference))
+    return float(gap.nan_to_num(torch.inf).max())
 
 
 def require_positive(
@@ -71,8 +70,7 @@ def require_positive(
         phi = effect.sample(len(one)).to(one.dtype)
     sd = applied(effect, one, phi, action, context)
     wrong = ~(sd > 0) & ~one.isnan()
-    if bool(wrong.any()):
-        row = int(wrong.flatten(1).any(1).nonzero()[0])
+    for row in wrong.flatten(1).any(1).nonzero()[:1, 0].tolist():
         raise ValueError(
             f"expected effect {effect.name!r} to keep the noise positive; got "
             f"{float(sd[row].min()):.3g} times its size at phi = {phi[row].tolist()}; "

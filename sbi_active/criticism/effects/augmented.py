@@ -13,11 +13,13 @@ from typing_extensions import override
 
 from sbi_active.criticism.effects.application import (
     applied,
-    change_at_null,
+    largest_change,
+    nulls,
     require_positive,
 )
 from sbi_active.criticism.effects.declarations import require_distinct
 from sbi_active.criticism.effects.effect import Context, Effect
+from sbi_active.expected import require
 from sbi_active.seeding import forked_generators, row_seeds
 from sbi_active.simulation import SimulatorModel
 from sbi_active.simulation.conditions import CONDITIONS, at_rows, played, typed
@@ -35,6 +37,10 @@ class _Rows:
     phi: dict[str, Tensor]
     action: Tensor
     context: Context
+
+    def at(self, some: slice) -> _Rows:
+        """Return some rows, without effects."""
+        return _Rows({}, self.action[some], self.context.at(some))
 
 
 class AugmentedSimulator(SimulatorModel):
@@ -101,8 +107,8 @@ class AugmentedSimulator(SimulatorModel):
         if check is not None and self._unchecked:
             known = sum(e.phi_dim for e in before if e.scope == "campaign")
             theta, action, *own = check
-            context = self._row_context(action, given=own[0] if own else None)
-            self._check_null(theta[:, : theta.shape[1] - known], action, context)
+            rows = self._rows({}, action, context=own[0] if own else None)
+            self._check_null(theta[:, : theta.shape[1] - known], rows)
 
     @property
     @override
@@ -145,10 +151,10 @@ class AugmentedSimulator(SimulatorModel):
         Returns:
             Shape (n, *x_shape).
         """
-        context = self._row_context(action, index, context)
-        self._check_first(theta, action, context)
+        rows = self._rows(phi, action, index, context)
+        self._check_first(theta, rows)
         merge = merge and self.noise is not None  # a draw is another at each call
-        return self._evaluate(theta, _Rows(phi, action, context), seeds, merge=merge)
+        return self._evaluate(theta, rows, seeds, merge=merge)
 
     def noise_scale(
         self,
@@ -168,19 +174,16 @@ class AugmentedSimulator(SimulatorModel):
             index: Place of each row's trial, as in :meth:`evaluate`.
             context: Context of the rows, as in :meth:`evaluate`.
         """
-        context = self._row_context(action, index, context)
-        return self._through("noise", sd, _Rows(phi, action, context))
+        return self._through("noise", sd, self._rows(phi, action, index, context))
 
     def split(self, parameters: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
         """Return theta and phi by effect from (theta, phi), shape (n, dim)."""
         campaign = [e for e in self.effects if e.scope == "campaign"]
         sizes = [e.phi_dim for e in campaign]
         theta_dim = parameters.shape[1] - sum(sizes)
-        if theta_dim < 1:
-            raise ValueError(
-                f"expected (theta, phi) with {sum(sizes)} numbers for the effects; got "
-                f"{parameters.shape[1]} columns; draw from joint_prior"
-            )
+        expected = f"(theta, phi) with {sum(sizes)} numbers for the effects"
+        got = f"{parameters.shape[1]} columns"
+        require(theta_dim > 0, expected, got, "draw from joint_prior")
         theta, *phi = parameters.split([theta_dim, *sizes], -1)
         return theta, {e.name: p for e, p in zip(campaign, phi, strict=True)}
 
@@ -210,15 +213,11 @@ class AugmentedSimulator(SimulatorModel):
         drawn: dict[str, Tensor] | None = None,
     ) -> Tensor:
         theta, phi = self.split(torch.as_tensor(theta))
-        phi |= drawn or {}
-        action = torch.as_tensor(action)
         told = {name: effects[name] for name in CONDITIONS if name in effects}
         rest = {name: value for name, value in effects.items() if name not in told}
-        context = self._row_context(action)
-        if told:
-            context = self._row_context(action, given=replace(context, **told))
-        self._check_first(theta, action, context)
-        return self._evaluate(theta, _Rows(phi, action, context), seeds, rest)
+        rows = self._rows(phi | (drawn or {}), torch.as_tensor(action), **told)
+        self._check_first(theta, rows)
+        return self._evaluate(theta, rows, seeds, rest)
 
     def _trial_draws(
         self, num: int, dtype: torch.dtype, seeds: Tensor | None
@@ -236,23 +235,27 @@ class AugmentedSimulator(SimulatorModel):
         draws = torch.cat(rows).to(dtype).split([e.phi_dim for e in trial], -1)
         return {e.name: d for e, d in zip(trial, draws, strict=True)}
 
-    def _row_context(
-        self, action: Tensor, index: Tensor | None = None, given: Context | None = None
-    ) -> Context:
-        """Return what effects may know of rows, of the type of their actions."""
-        if given is None:
-            if index is None:
-                index = torch.full((len(action),), float(self.next_index))
-            given = Context(index)
-        if given.times is None:
-            given = replace(given, times=self._times)
-        return Context(**{k: typed(v, action.dtype) for k, v in vars(given).items()})
+    def _rows(
+        self,
+        phi: dict[str, Tensor],
+        action: Tensor,
+        index: Tensor | None = None,
+        context: Context | None = None,
+        **told: Any,
+    ) -> _Rows:
+        """Return rows with what effects may know of them, of the type of actions."""
+        if index is None:
+            index = torch.full((len(action),), float(self.next_index))
+        known = vars(context or Context(index)) | told
+        if known["times"] is None:
+            known["times"] = self._times
+        return _Rows(phi, action, Context(**typed(known, action.dtype)))
 
-    def _check_first(self, theta: Tensor, action: Tensor, context: Context) -> None:
+    def _check_first(self, theta: Tensor, rows: _Rows) -> None:
         """Compare effects that were not yet with the simulator on a few rows."""
         few = slice(NUM_FIRST)
         if self._unchecked and len(theta):
-            self._check_null(theta[few], action[few], context.at(few))
+            self._check_null(theta[few], rows.at(few))
 
     def _active(self, hook: str, phi: dict[str, Tensor]) -> list[Effect]:
         return [e for e in self.effects if e.hook == hook and e.name in phi]
@@ -290,17 +293,13 @@ class AugmentedSimulator(SimulatorModel):
         """Return what the simulator's function is told of how its trials are run."""
         context, wanted = rows.context, self.base.conditions
         for effect in self._active("input", rows.phi):
-            if context.inputs is None or "inputs" not in wanted:
-                got = (
-                    "none in the trials"
-                    if context.inputs is None
-                    else "no such argument"
-                )
-                raise ValueError(
-                    f"expected inputs over time for effect {effect.name!r}, in the "
-                    f"trials and as an argument of the simulator's function; got {got}"
-                    "; pass Trials(inputs=...), and take fn(theta, action, *, inputs)"
-                )
+            require(
+                context.inputs is not None and "inputs" in wanted,
+                f"inputs over time for effect {effect.name!r}, in the trials and as an "
+                "argument of the simulator's function",
+                "no such argument" if context.inputs else "none in the trials",
+                "pass Trials(inputs=...), and take fn(theta, action, *, inputs)",
+            )
         inputs = self._through("input", context.inputs, rows)
         every = {**vars(context), "inputs": inputs}
         if context.times is not None:
@@ -328,41 +327,40 @@ class AugmentedSimulator(SimulatorModel):
         )
         return x[place]
 
-    def _check_null(self, theta: Tensor, action: Tensor, context: Context) -> None:
+    def _check_null(self, theta: Tensor, rows: _Rows) -> None:
         """Raise if an effect at its null changes x.
 
         It may do so by single precision, with room for a formula's rounding.
         """
         tolerance = 1e-4  # in deviations of x over the checked rows
-        rows = _Rows({}, action, context)
         x = self._seeded(theta, rows)
-        shapes = [x.shape, *(u.shape for u in (context.inputs or {}).values())]
+        shapes = [x.shape, *(u.shape for u in (rows.context.inputs or {}).values())]
         if any(len(x) in shape[1:] for shape in shapes) and len(x) > 1:
             # As many rows as entries hide phi that is spread over the wrong axis.
-            self._check_null(theta[:-1], action[:-1], context.at(slice(-1)))
+            self._check_null(theta[:-1], rows.at(slice(-1)))
             return
-        finite = x[x.isfinite()]
-        spread = float(finite.double().std()) if finite.numel() > 1 else 0.0
+        finite, one = x[x.isfinite()].double(), torch.ones_like(x)
+        spread = float(finite.std()) if len(finite) > 1 else 0.0
         scale = max(spread, float(finite.abs().mean()) if len(finite) else 0.0, 1e-30)
         for effect in self._unchecked:
-            changed, without, allowed = "x", x, tolerance * scale
+            changed, without, size = "x", x, scale
             if effect.hook == "noise":
-                changed, without, allowed = "the noise", torch.ones_like(x), tolerance
-
-            def at_null(null: Tensor, e: Effect = effect, x: Tensor = without) -> Any:
-                if e.hook == "noise":
-                    return applied(e, x, null, action, context)
-                return self._seeded(theta, replace(rows, phi={e.name: null}))
-
-            difference = change_at_null(without, at_null, effect)
-            if difference > allowed:
-                raise ValueError(
-                    f"expected effect {effect.name!r} to vanish at its null "
-                    f"{effect.null}; got {changed} changed by up to "
-                    f"{difference:.3g}; correct apply or null"
-                )
+                changed, without, size = "the noise", one, 1.0
+            difference = torch.inf
+            for null in nulls(effect, x):
+                own = replace(rows, phi={effect.name: null})
+                at_null = self._through("noise", one, own)
+                if effect.hook != "noise":
+                    at_null = self._seeded(theta, own)
+                difference = min(difference, largest_change(without, at_null))
+            require(
+                difference <= tolerance * size,
+                f"effect {effect.name!r} to vanish at its null {effect.null}",
+                f"{changed} changed by up to {difference:.3g}",
+                "correct apply or null",
+            )
             if effect.hook == "noise":
-                require_positive(effect, torch.ones_like(x), action, context)
+                require_positive(effect, one, rows.action, rows.context)
         self._unchecked = []
 
     def _seeded(self, theta: Tensor, rows: _Rows) -> Tensor:

@@ -4,19 +4,23 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal, get_args
 
 import torch
 from torch import Tensor
 from torch.distributions import Distribution
 
-from sbi_active.expected import suggests
+from sbi_active.criticism.data.arrays import rows_at
+from sbi_active.expected import require, suggests
 from sbi_active.inference.beliefs.priors import is_discrete
 from sbi_active.seeding import forked_generators
 from sbi_active.support import parts_of, support_of
 
 Hook = Literal["action", "input", "parameter", "dynamics", "observation", "noise"]
+SCOPES = ("campaign", "trial")
+#: Texts that an effect may do without.
+OPTIONAL = ("family", "describe")
 
 #: Stands for an infinite null where the formula has no limit in floating point.
 LARGE = 1e9
@@ -45,12 +49,14 @@ class Context:
     def at(self, rows: slice) -> Context:
         """Return the context of some rows."""
         times = self.times
-        return Context(
-            self.index[rows],
-            times if times is None or times.ndim == 1 else times[rows],
-            None if self.inputs is None else _at(self.inputs, rows),
-            self.input_times,
-            _at(self.start, rows),
+        if times is not None and times.ndim > 1:
+            times = times[rows]
+        return replace(
+            self,
+            index=self.index[rows],
+            times=times,
+            inputs=rows_at(self.inputs, rows),
+            start=rows_at(self.start, rows),
         )
 
 
@@ -109,17 +115,7 @@ class Effect:
 
     def __post_init__(self) -> None:
         _require_parts(self)
-        if self.hook not in get_args(Hook):
-            raise ValueError(
-                f"expected a hook of {', '.join(get_args(Hook))}; got {self.hook!r}; "
-                f"say what effect {self.name!r} changes"
-            )
-        if self.scope not in ("campaign", "trial"):
-            raise ValueError(
-                f"expected scope 'campaign' or 'trial'; got {self.scope!r}; choose one"
-            )
         object.__setattr__(self, "null", _sound_null(self))
-        _require_finite_draws(self)
         if self.family is None:
             object.__setattr__(self, "family", self.hook)
 
@@ -155,11 +151,9 @@ class Effect:
         effect = cls(
             name, hook="dynamics", prior=prior, apply=_Keywords(names), **options
         )
-        if len(names) != effect.phi_dim:
-            raise ValueError(
-                f"expected {effect.phi_dim} keywords for effect {name!r}, one an entry "
-                f"of phi; got {', '.join(names)}; name each"
-            )
+        expected = f"{effect.phi_dim} keywords for effect {name!r}, one an entry of phi"
+        same = len(names) == effect.phi_dim
+        require(same, expected, ", ".join(names), "name each")
         return effect
 
     @property
@@ -203,12 +197,6 @@ class Effect:
         return null.expand(self.phi_dim).repeat(num, 1)
 
 
-def _at(value: Any, rows: slice) -> Any:
-    if isinstance(value, dict):
-        return {name: part[rows] for name, part in value.items()}
-    return None if value is None else value[rows]
-
-
 @dataclass(frozen=True)
 class _Keywords:
     """Hands phi to the simulator's function."""
@@ -222,68 +210,61 @@ class _Keywords:
 
 
 def _require_parts(effect: Effect) -> None:
-    """Raise if a part of an effect is of another type than it should be."""
-    texts = {"name": effect.name, "units": effect.units}
-    texts |= {
-        name: value
-        for name in ("family", "describe")
-        if (value := getattr(effect, name)) is not None
-    }
-    for part, value in texts.items():
-        if not isinstance(value, str):
-            raise ValueError(
-                f"expected {part} of an effect as text; got {value!r}; pass a string"
-            )
-    if not effect.name:
-        raise ValueError("expected a name of an effect; got ''; pass one")
-    if not isinstance(effect.prior, Distribution):
-        raise ValueError(
-            f"expected a torch distribution as prior of effect {effect.name!r}; got "
-            f"{effect.prior!r}; pass for example Normal(0.0, 1.0)"
-        )
-    if any(is_discrete(part) for part in parts_of(effect.prior.support)):
-        raise ValueError(
-            f"expected a continuous prior of effect {effect.name!r}; got a discrete "
-            "one; declare one effect for each value, which then compete"
-        )
-    if not callable(effect.apply):
-        raise ValueError(
-            f"expected apply of effect {effect.name!r} as a function of (value, phi, "
-            f"action, context); got {effect.apply!r}; pass one"
-        )
+    """Raise if a part of an effect is none, or of another type than it should be."""
+    own = f"of effect {effect.name!r}"
+    for part in ("name", "units", "family", "describe"):
+        value = getattr(effect, part)
+        is_text = isinstance(value, str) or (value is None and part in OPTIONAL)
+        require(is_text, f"{part} of an effect as text", repr(value), "pass a string")
+    require(bool(effect.name), "a name of an effect", "''", "pass one")
+    require(
+        isinstance(effect.prior, Distribution),
+        f"a torch distribution as prior {own}",
+        repr(effect.prior),
+        "pass for example Normal(0.0, 1.0)",
+    )
+    require(
+        not any(is_discrete(part) for part in parts_of(effect.prior.support)),
+        f"a continuous prior {own}",
+        "a discrete one",
+        "declare one effect for each value, which then compete",
+    )
+    expected = f"apply {own} as a function of (value, phi, action, context)"
+    require(callable(effect.apply), expected, repr(effect.apply), "pass one")
+    known = ", ".join(get_args(Hook))
+    advice = f"say what effect {effect.name!r} changes"
+    is_hook = effect.hook in get_args(Hook)
+    require(is_hook, f"a hook of {known}", repr(effect.hook), advice)
+    is_scope, expected = effect.scope in SCOPES, "scope 'campaign' or 'trial'"
+    require(is_scope, expected, repr(effect.scope), "choose one")
 
 
 def _sound_null(effect: Effect) -> Any:
     """Return the null, a copy where it is an array, or raise where it is none."""
+    own, pass_it = f"a null of effect {effect.name!r}", "pass the value of phi at which"
     try:
         null = torch.as_tensor(effect.null, dtype=torch.float64)
     except (TypeError, ValueError, RuntimeError) as error:
         raise ValueError(
-            f"expected a null of effect {effect.name!r} in numbers; got "
-            f"{effect.null!r}; pass the value of phi at which it vanishes"
+            f"expected {own} in numbers; got {effect.null!r}; {pass_it} it vanishes"
         ) from error
-    if null.numel() not in (1, effect.phi_dim):
-        raise ValueError(
-            f"expected a null of shape ({effect.phi_dim},), the shape of a draw of "
-            f"effect {effect.name!r}; got {tuple(null.shape)}; give one each"
-        )
-    if bool(null.isnan().any()):
-        raise ValueError(
-            f"expected a null of effect {effect.name!r}; got NaN; pass the value of "
-            "phi at which it vanishes, which may be infinite"
-        )
-    return copy.deepcopy(effect.null)
-
-
-def _require_finite_draws(effect: Effect) -> None:
-    """Raise if the prior gives phi that is no number."""
+    require(
+        null.numel() in (1, effect.phi_dim),
+        f"a null of shape ({effect.phi_dim},), the shape of a draw of effect "
+        f"{effect.name!r}",
+        tuple(null.shape),
+        "give one each",
+    )
+    advice = f"{pass_it} it vanishes, which may be infinite"
+    require(not bool(null.isnan().any()), own, "NaN", advice)
     lost = ~effect.declared_draws().isfinite()
-    if bool(lost.any()):
-        raise ValueError(
-            f"expected finite draws from the prior of effect {effect.name!r}; got NaN "
-            f"or inf in {int(lost.any(-1).sum())} of {NUM_DRAWS}; pass a prior whose "
-            "draws are numbers"
-        )
+    require(
+        not bool(lost.any()),
+        f"finite draws from the prior of effect {effect.name!r}",
+        f"NaN or inf in {int(lost.any(-1).sum())} of {NUM_DRAWS}",
+        "pass a prior whose draws are numbers",
+    )
+    return copy.deepcopy(effect.null)
 
 
 @dataclass(frozen=True)

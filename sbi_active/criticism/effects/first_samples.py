@@ -30,7 +30,9 @@ from sbi_active.arrays import Array
 from sbi_active.callers import stack_level
 from sbi_active.criticism.data.arrays import repeated
 from sbi_active.criticism.data.trials import Trials
+from sbi_active.criticism.effects.changes import Wrapped
 from sbi_active.criticism.effects.effect import Context, Effect, Hook
+from sbi_active.expected import require
 from sbi_active.messages import warn
 
 #: Standard errors in a deviation of the nuisance.
@@ -90,7 +92,8 @@ def start_from_first_samples(
         >>> nuisance.scope, nuisance.phi_dim
         ('trial', 2)
     """
-    if trials.start is not None and not isinstance(trials.start, dict):
+    known = {} if trials.start is None else trials.start
+    if not isinstance(known, dict):
         raise ValueError(
             "expected measured start states by name; got an array; pass "
             "Trials(start={name: ...}), whose names the simulator tells apart"
@@ -108,7 +111,7 @@ def start_from_first_samples(
         )
     copy = trials.select(slice(None))
     shown = dict(zip(start, torch.from_numpy(values.T.copy()), strict=True))
-    copy.start = {**(trials.start or {}), **shown}
+    copy.start = {**known, **shown}
     copy.repeat_of = repeated(copy.settings())
     return copy, _nuisance(name, "dynamics", _Shifted((*start,)), width * errors)
 
@@ -153,8 +156,10 @@ def zero_from_first_samples(
     each = [(channel, 0) for channel in channels]
     values, errors, _ = _fitted(trials, each, 0, within, sd)
     copy = trials.select(slice(None))
-    copy.x = _Offset((*channels,))(trials.x, torch.from_numpy(-values))
-    return copy, _nuisance(name, "observation", _Offset((*channels,)), width * errors)
+    offset = Wrapped("offset", channel=None if copy.x.ndim == 2 else (*channels,))
+    zero = torch.from_numpy(-values).to(copy.x.dtype)
+    copy.x = offset(copy.x, zero, copy.action, Context(copy.index))
+    return copy, _nuisance(name, "observation", offset, width * errors)
 
 
 @dataclass(frozen=True)
@@ -171,22 +176,6 @@ class _Shifted:
             return value
         own = dict(zip(self.names, phi.unbind(-1), strict=True))
         return {**value, "start": {k: v + own.get(k, 0) for k, v in start.items()}}
-
-
-@dataclass(frozen=True)
-class _Offset:
-    """Adds phi to some entries of x."""
-
-    channels: tuple[int, ...]
-
-    def __call__(
-        self, value: Tensor, phi: Tensor, action: Any = None, context: Any = None
-    ) -> Tensor:
-        if value.ndim == 2:
-            return value + phi.to(value.dtype)
-        offset = torch.zeros_like(value)
-        offset[..., list(self.channels)] = phi.to(value.dtype)[:, None]
-        return value + offset
 
 
 def _nuisance(name: str, hook: Hook, apply: Any, deviations: Array) -> Effect:
@@ -218,70 +207,59 @@ def _fitted(
         The derivatives, their standard errors, and the tail probability of what the
         polynomial leaves; the last by trial, the smallest of the k.
     """
-    sds = _deviations(trials, sd, [channel for channel, _ in wanted])
+    series, sds = _series(trials, sd, [channel for channel, _ in wanted])
+    times = trials.sample_times
+    assert times is not None
+    stamps = times.double().expand(trials.x.shape[:2]).numpy()
     values, errors = np.empty((2, len(trials), len(wanted)))
     p_value = np.ones(len(trials))
     for i in range(len(trials)):
-        for j, ((channel, order), own) in enumerate(zip(wanted, sds, strict=True)):
-            t, x = _first(trials, i, channel, within, degree)
+        for j, (_, order) in enumerate(wanted):
+            t, x = _first(trials, i, stamps[i], series[i, j], within, degree)
             t = t - (t[0] if at is None else at)
             value, error = _polynomial(t, x, degree)
             misfit = x - np.polynomial.Polynomial(value)(t)
-            freedom = max(len(t) - degree - 1, 1)
+            freedom, own = max(len(t) - degree - 1, 1), sds[j]
             p_value[i] = min(p_value[i], chi2.sf(np.sum((misfit / own) ** 2), freedom))
             values[i, j] = factorial(order) * value[order]
             errors[i, j] = factorial(order) * own * error[order]
     return values, errors, p_value
 
 
-def _deviations(
+def _series(
     trials: Trials, sd: float | Sequence[float], channels: Sequence[int]
-) -> list[float]:
-    """Return the sensor's deviation at each of some entries of x, or raise."""
-    if trials.sample_times is None:
-        raise ValueError(
-            "expected trials with sample times, which say what is first; got none; "
-            "pass Trials(sample_times=...)"
-        )
-    if trials.x.ndim > 3:
-        raise ValueError(
-            "expected x of shape (n, k) or (n, k, channels); got "
-            f"{tuple(trials.x.shape)}; bring what a sample has onto one axis"
-        )
-    num = 1 if trials.x.ndim == 2 else trials.x.shape[-1]
-    wrong = [c for c in channels if not 0 <= c < num]
-    if wrong:
-        raise ValueError(
-            f"expected entries of x's last axis from 0 to {num - 1}; got {wrong[0]}; "
-            "number them from 0"
-        )
-    every = np.broadcast_to(np.asarray(sd, dtype=float), (num,))
-    if not (every > 0).all():
-        raise ValueError(
-            f"expected a standard deviation > 0 of the sensor; got {sd}; pass its error"
-        )
-    return [float(every[c]) for c in channels]
+) -> tuple[Array, Array]:
+    """Return some entries of x, (n, c, k), and their sensor deviations, (c,)."""
+    advice = "pass Trials(sample_times=...)"
+    expected = "trials with sample times, which say what is first"
+    require(trials.sample_times is not None, expected, "none", advice)
+    expected, shape = "x of shape (n, k) or (n, k, channels)", tuple(trials.x.shape)
+    advice = "bring what a sample has onto one axis"
+    require(len(shape) <= 3, expected, shape, advice)
+    x = trials.x.double().numpy().reshape(*shape[:2], -1)
+    wrong = [c for c in channels if not 0 <= c < x.shape[2]]
+    expected = f"entries of x's last axis from 0 to {x.shape[2] - 1}"
+    require(not wrong, expected, wrong, "number them from 0")
+    every = np.broadcast_to(np.asarray(sd, dtype=float), (x.shape[2],))
+    expected = "a standard deviation > 0 of the sensor"
+    require(bool((every > 0).all()), expected, sd, "pass its error")
+    return x[:, :, [*channels]].transpose(0, 2, 1), every[[*channels]]
 
 
 def _first(
-    trials: Trials, i: int, channel: int, within: float, degree: int
+    trials: Trials, i: int, t: Array, x: Array, within: float, degree: int
 ) -> tuple[Array, Array]:
     """Return times and values of a trial's first samples, or raise if they are few."""
-    times = trials.sample_times
-    assert times is not None
-    t = (times if times.ndim == 1 else times[i]).double().numpy()
-    x = trials.x[i].double().numpy()
-    x = x if x.ndim == 1 else x[:, channel]
     seen = np.isfinite(t) & np.isfinite(x)
     t, x = t[seen], x[seen]
     kept = t - t[:1] < within
-    if kept.sum() < degree + 1:
-        apart = f", which are {np.median(np.diff(t)):.3g} apart" if len(t) > 1 else ""
-        raise ValueError(
-            f"expected {degree + 1} or more samples within {within:g} of the first; "
-            f"got {int(kept.sum())} in {trials.called([i])}{apart}; pass a larger "
-            "within, or name the unit of the times, as in time_ms"
-        )
+    apart = f", which are {np.median(np.diff(t)):.3g} apart" if len(t) > 1 else ""
+    require(
+        bool(kept.sum() > degree),
+        f"{degree + 1} or more samples within {within:g} of the first",
+        f"{int(kept.sum())} in {trials.called([i])}{apart}",
+        "pass a larger within, or name the unit of the times, as in time_ms",
+    )
     return t[kept], x[kept]
 
 

@@ -10,12 +10,14 @@ import torch
 from torch import Tensor
 from torch.distributions import Distribution
 
-from sbi_active.actions import ActionSpace, DiscreteActions
+from sbi_active.actions import ActionSpace
 from sbi_active.criticism.data.trials import Trials
+from sbi_active.criticism.data.units import split
 from sbi_active.criticism.effects.changes import Wrapped
 from sbi_active.criticism.effects.effect import Effect, Hook
 from sbi_active.criticism.effects.table import rows_of
 from sbi_active.criticism.effects.trial_conditions import conditions_for, has_own_times
+from sbi_active.expected import require
 from sbi_active.seeding import forked_generators, row_seeds
 from sbi_active.simulation import SimulatorModel
 
@@ -58,43 +60,50 @@ def generic_effects(
     Raises:
         ValueError: If neither noise nor prior says how large x and its errors are.
     """
-    if model.noise is None and prior is None:
-        raise ValueError(
-            "expected a simulator with declared noise, or its prior; got neither, so "
-            "nothing says how large a bias may be; give prior="
-        )
+    require(
+        model.noise is not None or prior is not None,
+        "a simulator with declared noise, or its prior",
+        "neither, so nothing says how large a bias may be",
+        "give prior=",
+    )
     sd = None if model.noise is None else model.noise.declared_sds()
     draws = None if prior is None else _prior_draws(model, actions, prior)
     times, signals, trials = model.sample_times, model.inputs, None
     inputs, grid = None, None
     if isinstance(actions, Trials):
         trials, inputs, grid = actions, actions.inputs, actions.input_times
+        values, units = trials.action, [_unit(n) for n in trials.action_labels or ()]
         times = times if has_own_times(model, actions) else actions.sample_times
+    else:
+        values, units = actions.sample((NUM_ACTIONS,), seed=0).double(), actions.units
     found = []
     if signals is not None:
         if inputs is None:
-            inputs, grid = signals.inputs(_some(actions)), signals.input_times
+            inputs, grid = signals.inputs(values), signals.input_times
     elif trials is None or not trials.action_is_label:
-        space = _recorded(actions) if isinstance(actions, Trials) else actions
-        unit = space.units[0] if len({*space.units}) == 1 else ""
+        unit = units[0] if len({*units}) == 1 else ""
         words = {"who": "the action", "before": "", "unit": unit}
-        found += _made("command", "action", "action", _command(_some(space)), words)
+        sizes = _command(values.float().double())  # an executed action is single
+        found += _made("command", "action", "action", sizes, words)
     if inputs is not None:
-        assert grid is not None
         delay = min(typical_delay(t) for t in (grid, times) if t is not None)
         labels = None if trials is None else trials.input_labels
         found += _of_inputs(inputs, labels, delay)
-    if times is None:
-        late: dict[str, Tensor] = {}
-    elif trials is None and inputs is None:
+    late: dict[str, Tensor] = {}
+    if times is not None and trials is None and inputs is None:
         late = {"late": torch.tensor([LATE * float(times.max() - times.min())])}
-    else:
+    elif times is not None:
         far = times.nan_to_num(-torch.inf).max() - times.nan_to_num(torch.inf).min()
         late = {"span": far, "delay": torch.tensor([typical_delay(times)])}
     if trials is None or times is None:
         return [*found, *_of_sensor(sd, draws, late)]
     names = trials.channel_labels or model.channel_names
     return [*found, *_of_sensors(trials.x, names, sd, draws, late)]
+
+
+def _unit(label: str) -> str:
+    """Return what stands in the brackets of a label."""
+    return split(label)[1]
 
 
 def typical_delay(times: Tensor) -> float:
@@ -131,18 +140,6 @@ def _made(
     ]
 
 
-def _some(actions: ActionSpace | Trials) -> Tensor:
-    if isinstance(actions, Trials):
-        return actions.action
-    return actions.sample((NUM_ACTIONS,), seed=0).double()
-
-
-def _recorded(trials: Trials) -> ActionSpace:
-    labels = trials.action_labels or ()
-    units = [label.partition(" [")[2].removesuffix("]") for label in labels]
-    return DiscreteActions(trials.action.unique(dim=0), units=units or None)
-
-
 def _command(some: Tensor) -> dict[str, Tensor]:
     """Return sizes of commands, shape (n, k)."""
     low, high = some.min(0).values, some.max(0).values
@@ -166,8 +163,7 @@ def _of_inputs(
         sizes = _command(value[value.isfinite()].double()[:, None])
         if bool((value.diff(dim=1) != 0).any()):
             sizes |= {"play": sizes["range"], "delay": torch.tensor([delay])}
-        unit = label.partition(" [")[2].removesuffix("]")
-        words = {"who": f"the input {name}", "before": before, "unit": unit}
+        words = {"who": f"the input {name}", "before": before, "unit": _unit(label)}
         own = before or "input"
         found += _made("command", "input", own, sizes, words, inputs=(name,))
     return found

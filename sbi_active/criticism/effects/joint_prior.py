@@ -12,6 +12,7 @@ from typing_extensions import override
 
 from sbi_active.criticism.effects.declarations import require_distinct
 from sbi_active.criticism.effects.effect import Effect
+from sbi_active.expected import require
 from sbi_active.seeding import kept_generators
 from sbi_active.support import support_of
 
@@ -49,12 +50,12 @@ class JointPrior(Distribution):
     @property
     @override
     def mean(self) -> Tensor:
-        return torch.cat([_moment(d, "mean") for d in self._parts()])
+        return torch.cat([d.mean.reshape(-1) for d in self._parts()])
 
     @property
     @override
     def variance(self) -> Tensor:
-        return torch.cat([_moment(d, "variance") for d in self._parts()])
+        return torch.cat([d.variance.reshape(-1) for d in self._parts()])
 
     @override
     def sample(self, sample_shape: Any = ()) -> Tensor:
@@ -68,7 +69,7 @@ class JointPrior(Distribution):
     def log_prob(self, value: Tensor) -> Tensor:
         rows = value.reshape(-1, sum(self.sizes))
         theta, *phi = rows.split(self.sizes, -1)
-        inside = _rows(support_of(self.prior).check(theta))
+        inside = support_of(self.prior).check(theta)[:, None].flatten(1).all(-1)
         with kept_generators():  # any place in the support will do
             place = self.prior.sample(torch.Size([1]))
         safe = torch.where(inside[:, None], theta, place)
@@ -103,28 +104,14 @@ def joint_prior(prior: Distribution, effects: Sequence[Effect]) -> JointPrior:
     return JointPrior(prior, [e for e in effects if e.scope == "campaign"])
 
 
-def _rows(inside: Tensor) -> Tensor:
-    return inside[:, None].flatten(1).all(-1)
-
-
 def _elementwise(support: Any) -> constraints.Constraint:
     """Return a constraint on single numbers, which torch can concatenate."""
     while support.event_dim > 0 and hasattr(support, "base_constraint"):
         support = support.base_constraint
-    if support.event_dim > 0:
-        raise ValueError(
-            "expected priors whose numbers are bounded one by one; got a support "
-            f"{support}; give parameters in coordinates without such a constraint"
-        )
+    require(
+        support.event_dim == 0,
+        "priors whose numbers are bounded one by one",
+        f"a support {support}",
+        "give parameters in coordinates without such a constraint",
+    )
     return support
-
-
-def _moment(distribution: Distribution, name: str) -> Tensor:
-    """Return a mean or variance, by 10,000 draws where there is no formula."""
-    try:
-        return torch.as_tensor(getattr(distribution, name)).reshape(-1)
-    except NotImplementedError:
-        with torch.random.fork_rng(devices=[]):
-            torch.default_generator.manual_seed(0)
-            draws = distribution.sample(torch.Size([10_000])).reshape(10_000, -1)
-        return draws.mean(0) if name == "mean" else draws.var(0)

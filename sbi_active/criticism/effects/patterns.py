@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Iterable, Sequence
 from fnmatch import fnmatchcase
 
 from sbi_active.criticism.effects.effect import Effect
+from sbi_active.expected import did_you_mean, require
 
 Patterns = str | Iterable[str]
 
@@ -34,13 +34,12 @@ def picked(
     )
     names = [effect.name for effect in effects]
     for pattern in [*kept, *left] if strict else ():
-        if not any(fnmatchcase(name, pattern) for name in names):
-            near = difflib.get_close_matches(pattern, names, cutoff=0.5)
-            hint = f"did you mean {' or '.join(map(repr, near))}?"
-            raise ValueError(
-                f"expected patterns of names as in {names[0]!r}; got {pattern!r}, "
-                f"which matches none; {hint if near else 'correct it'}"
-            )
+        require(
+            any(fnmatchcase(name, pattern) for name in names),
+            f"patterns of names as in {names[0]!r}",
+            f"{pattern!r}, which matches none",
+            did_you_mean(pattern, names, "correct it"),
+        )
 
     def fits(name: str, patterns: list[str]) -> bool:
         return any(fnmatchcase(name, pattern) for pattern in patterns)

@@ -14,11 +14,9 @@ from torch import Tensor
 from torch.distributions import Distribution, HalfNormal, Independent, Normal, Uniform
 
 from sbi_active.criticism.effects.effect import Effect
-from sbi_active.expected import require
 
 #: A factor of a formula such as "0.1 position / load^2".
 FACTOR = re.compile(r"(/?) *([\w.-]+)\^?(\d?)")
-FORMULA = re.compile(r" *[\w.-]+(\^\d)?(( +| */ *)[\w.-]+(\^\d)?)* *")
 PRIOR = re.compile(r"(log limit|limit|half|normal) +(.*)")
 
 
@@ -85,30 +83,15 @@ class Row:
 
 @cache
 def rows_of(table: Path) -> tuple[Row, ...]:
-    """Return the rows of a table.
-
-    Raises:
-        ValueError: If a row lacks a cell, or its prior is not written as one.
-    """
+    """Return the rows of a table."""
     lines = table.read_text(encoding="utf-8").splitlines()
-    named = [(k, line) for k, line in enumerate(lines, 1) if line.startswith("|")]
-    cells = [[cell.strip() for cell in line.split("|")[1:-1]] for _, line in named]
-    columns, rows = cells[0], []
-    for (k, line), each in zip(named[2:], cells[2:], strict=True):
-        known = dict(zip(columns, each, strict=False))
-        kind, formulas = _parts(known.get("prior", ""))
-        parts = formulas.split(",")
-        is_formula = all(map(FORMULA.fullmatch, parts))
-        require(
-            len(each) == len(columns)
-            and is_formula
-            and (len(parts) == 2 or "limit" not in kind),
-            f"cells {', '.join(columns)}, the prior as in 'half 0.2 force / speed'",
-            f"{line!r} in line {k} of {table.name}",
-            "correct the row",
-        )
-        rows.append(Row(**known))
-    return tuple(rows)
+    cells = [
+        [cell.strip() for cell in line.split("|")[1:-1]]
+        for line in lines
+        if line.startswith("|")
+    ]
+    columns, _, *rows = cells
+    return tuple(Row(**dict(zip(columns, row, strict=True))) for row in rows)
 
 
 def prior_of(text: str, sizes: Mapping[str, Any]) -> Distribution:
@@ -132,9 +115,10 @@ def prior_of(text: str, sizes: Mapping[str, Any]) -> Distribution:
 
 
 def _parts(text: str) -> tuple[str, str]:
-    """Return the kind of a prior and its formulas, nothing if it is no prior."""
+    """Return the kind of a prior and its formulas."""
     match = PRIOR.match(text)
-    return ("", "") if match is None else (match[1], match[2])
+    assert match is not None, text
+    return match[1], match[2]
 
 
 def _number(formula: str, sizes: Mapping[str, Any]) -> Tensor:

@@ -80,19 +80,13 @@ def settle(
         settling: When a verdict is settled.
 
     Raises:
-        ValueError: If there are no permitted actions, x is compared by summaries, or
-            the folder belongs to other trials.
+        ValueError: If there are no permitted actions, or the folder belongs to other
+            trials.
         VerdictError: If the comparison fails after a trial was run.
     """
     first = compare(trials)
     expected = "the permitted actions with real_system"
     require(first.actions is not None, expected, None, "pass actions=")
-    require(
-        not first.num_summaries,
-        "all numbers of x with real_system, whose outcome is predicted",
-        f"{first.num_summaries} summaries",
-        "pass summaries=0",
-    )
     journal = Journal(directory)
     journal.begin(digest=first.digest, num_trials=len(trials))
     tested = journal.tested()
@@ -178,8 +172,6 @@ def _verdict(
 
 
 NAME = "trials.jsonl"
-#: Fields of a prediction that are arrays.
-ARRAYS = ("action", "mean", "sd", "position", "bare")
 
 
 class Journal:
@@ -203,9 +195,8 @@ class Journal:
         if self.path is None:
             return
         self.path.parent.mkdir(parents=True, exist_ok=True)
-        line = json.dumps(
-            {"event": event, **parts}, default=operator.methodcaller("tolist")
-        )
+        said = {"event": event, **parts}
+        line = json.dumps(said, default=operator.methodcaller("tolist"))
         with self.path.open("a", encoding="utf-8") as file:
             file.write(f"{line}\n")
             file.flush()
@@ -221,11 +212,11 @@ class Journal:
             ValueError: If the folder belongs to other trials or another library.
         """
         if not self.events:
-            return self.write("begun", **about)
+            self.write("begun", **about)
+            return
         own = {name: self.events[0].get(name) for name in about}
         advice = "pass what it was begun with, or another directory"
         require(own == about, f"the trials of {self.path}, {own}", about, advice)
-        return None
 
     def tested(self) -> list[TestedTrial]:
         """Return the trials that were measured, each with its prediction."""
@@ -245,9 +236,9 @@ class Journal:
 
 
 def _registered(event: dict[str, Any]) -> Registered:
-    parts = {f.name: event[f.name] for f in fields(Registered)}
-    arrays: dict[str, Any] = {name: np.asarray(parts[name]) for name in ARRAYS}
-    return Registered(**{**parts, **arrays})
+    own = {f.name: event[f.name] for f in fields(Registered)}
+    arrays = {k: np.asarray(v) for k, v in own.items() if isinstance(v, list)}
+    return Registered(**{**own, **arrays})
 
 
 def _read(path: Path) -> list[dict[str, Any]]:

@@ -12,7 +12,6 @@ from torch import Tensor
 from sbi_active.actions import ActionSpace, DiscreteActions
 from sbi_active.arrays import Array
 from sbi_active.criticism.evidence.rival_set import RivalSet
-from sbi_active.criticism.forces.library import is_force
 from sbi_active.criticism.next_trial.candidates import (
     PLAN,
     following,
@@ -130,8 +129,6 @@ def choose_action(
     )
     if len(named) < 2:
         return found
-    if any(is_force(e) for e in rivals.library if e.name in tracing.chosen):
-        found = own.by_range(found, actions)
     groups = [g & {*named} for g in tracing.equivalent]
     if action is None:
         groups.append(frozenset(named))
@@ -166,36 +163,6 @@ class _Choosing:
             gain[others] = design.expected_information_gain.clamp_min(0.0).numpy()
             told = gain[others[design.index]]
         return (design.action.double().numpy() if told >= PLAN.nothing else None), gain
-
-    def by_range(self, found: NextAction, actions: ActionSpace) -> NextAction:
-        """Return the choice with the best action within the range tried, and beyond it.
-
-        Within it forms of a force look alike, or the trials had told them apart; a
-        prediction beyond it rests on the form.
-        """
-        tried, gain = self.rivals.trials.action, found.information_gain
-        candidates = torch.from_numpy(found.candidates)
-        low, high = tried.min(0).values.double(), tried.max(0).values.double()
-        inside = ((candidates >= low) & (candidates <= high)).all(-1).numpy()
-        if inside.any():
-            best = int(np.argmax(np.where(inside, gain, -np.inf)))
-            told = float(gain[best])
-            found = replace(found, within=found.candidates[best], within_gain=told)
-        if not inside.all():
-            best = int(np.argmax(np.where(inside, -np.inf, gain)))
-            beyond, told = found.candidates[best], float(gain[best])
-        else:
-            limit = PLAN.max_outside
-            others = outside_candidates(actions, candidates.float(), limit=limit)
-            others = simulated(self.rivals, others)
-            if not len(others):
-                return found
-            shares = [self.tracing.probabilities.get(n, 0.0) for n in found.separates]
-            p = np.maximum(shares, PLAN.fewest)
-            design = self.select(found.separates, p / p.sum(), others)
-            told = float(design.expected_information_gain[design.index])
-            beyond = design.action.double().numpy()
-        return replace(found, beyond=beyond, beyond_gain=max(told, 0.0))
 
     def look_outside(self, found: NextAction, others: Tensor) -> NextAction:
         """Return the choice with an action that is not permitted, if one separates."""

@@ -9,9 +9,7 @@ import numpy as np
 
 from sbi_active.criticism.report.contents import Contents
 from sbi_active.criticism.report.summary import added
-from sbi_active.criticism.report.words import phrase
 from sbi_active.criticism.results import Array, Evaluation, Residuals, Tracing
-from sbi_active.display.page import Picture
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -23,6 +21,14 @@ METRICS = {
     "energy score": "energy score",
     "log predictive density": "log predictive density [nats]",
     "coverage": "share inside the central 90 %",
+}
+CAPTIONS = {
+    "residuals": "Residuals of the models refitted to all trials, in standard "
+    "deviations of the prediction; the band is two of them. Each row has its scale, "
+    "logarithmic beyond the band where residuals are large.",
+    "probabilities": "Posterior probability of the models that were tried.",
+    "before_after": "One line a scored trial; the bars are over all of them. Lower is "
+    "better for the first two, higher for the third; the dotted line is 90 %.",
 }
 
 
@@ -44,16 +50,11 @@ def figures(report: Contents) -> dict[str, Figure]:
     return found
 
 
-def pictured(name: str) -> Picture:
-    """Return the place of the figure with a name."""
-    return Picture(name, phrase(f"figure, {name}"), phrase(f"figure, {name}"))
-
-
 def plot_residuals(
     before: Residuals,
     after: Residuals | None = None,
     *,
-    action_labels: Sequence[str] | None = None,
+    action_labels: Sequence[str] = (),
     channel_names: Sequence[str] | None = None,
     added: str = "the effect",
 ) -> Figure:
@@ -77,18 +78,15 @@ def plot_residuals(
     rows = [(before, "bare model", BEFORE)]
     if after is not None:
         rows.append((after, f"with {added}", AFTER))
-    labels = action_labels
-    if labels is None:
-        labels = [f"action {i + 1}" for i in range(before.action.shape[1])]
-    shown = min(len(labels), 3)
+    shown = min(len(action_labels), 3)
     several = before.x[0].size > 1
     columns = shown + 1 + several
     figure, axes = _subplots(len(rows), columns, width=3.3, height=2.5)
     for line, (residuals, title, color) in zip(axes, rows, strict=True):
-        each = _entries(residuals.refitted)
+        each = residuals.refitted.reshape(len(residuals.index), -1)
         for i in range(shown):
             _scatter(line[i], residuals.action[:, i], each, color)
-            line[i].set_xlabel(labels[i])
+            line[i].set_xlabel(action_labels[i])
         _scatter(line[shown], residuals.index, each, color)
         _trial_axis(line[shown], residuals)
         if several:
@@ -170,7 +168,7 @@ def _by_entry(
     ax: Axes, residuals: Residuals, color: str, channel_names: Sequence[str] | None
 ) -> None:
     """Draw one line a trial over time, or points over the channels."""
-    each = _entries(residuals.refitted)
+    each = residuals.refitted.reshape(len(residuals.index), -1)
     if residuals.times is not None:
         length = residuals.x.shape[1]
         times = np.broadcast_to(residuals.times, (len(each), length))
@@ -224,10 +222,6 @@ def _plain(ax: Axes) -> None:
     ax.tick_params(labelsize=8)
     ax.xaxis.label.set_fontsize(9)  # type: ignore[attr-defined]  # by its alias
     ax.yaxis.label.set_fontsize(9)  # type: ignore[attr-defined]
-
-
-def _entries(z: Array) -> Array:
-    return z.reshape(len(z), -1)
 
 
 def _subplots(

@@ -14,7 +14,7 @@ import numpy as np
 
 from sbi_active.criticism.report.contents import Contents
 from sbi_active.criticism.report.summary import not_told_from
-from sbi_active.criticism.report.words import listed, number, phrase, stated
+from sbi_active.criticism.report.words import listed, number, stated
 from sbi_active.criticism.results import NONE, OUTLIER, ModelKey
 
 Decision = Literal[
@@ -34,6 +34,7 @@ EXIT_CODES: dict[Decision, int] = {
     "WRONG_MODEL": 13,
     "NOT_ENOUGH_DATA": 14,
 }
+MORE = "measure more"
 
 
 @dataclass(frozen=True)
@@ -86,37 +87,42 @@ def gate_of(
     tracing, scored = report.tracing, report.evaluation
     num = 0 if scored is None else len(scored.trials)
     if scored is None or num < fewest:
-        reason = phrase("gate, scored", num, fewest)
-        return Gate("NOT_ENOUGH_DATA", reason, {"scored": num})
+        reason = f"{num} trials were scored that had no part in the fit, and {fewest} "
+        return Gate("NOT_ENOUGH_DATA", f"{reason}are needed; {MORE}", {"scored": num})
     if (narrow := _beyond_prior(report, level)) is not None:
         return narrow
     if report.verdict == OUTLIER:
+        reason = "one trial does not agree with the others; check and repeat it"
         names = [tracing.trial_names.get(i, i) for i in tracing.outliers]
-        return Gate("NOT_ENOUGH_DATA", phrase("gate, outlier"), {"trials": names[:1]})
-    before, after = report.rmse
-    errors = {"before": before, "after": after}
-    table = report.residuals_by_trial.head(1).dropna(axis="columns")
-    worst = {"worst": next(iter(table.to_dict("records")), {})}
+        return Gate("NOT_ENOUGH_DATA", reason, {"trials": names[:1]})
     if report.verdict != NONE:
-        return _wrong(report, errors, worst)
+        return _wrong(report)
     missed = [trial.name for trial in scored.missed]
     uncovered = np.isnan(scored.p_value) and np.mean(scored.after["coverage"]) < covered
     if missed or scored.p_value < level or uncovered:
         which = f"trials {listed(missed)}" if missed else f"the {num} scored trials"
-        details = {"trials": missed, **worst}
-        return Gate("WRONG_MODEL", phrase("gate, missed", which), details)
+        reason = f"{which} are far outside what the simulator predicts"
+        return Gate("WRONG_MODEL", reason, {"trials": missed, "worst": _worst(report)})
     if found := report.combinations:
         return Gate("NOT_IDENTIFIABLE", str(found), {"combinations": found.to_dict()})
     if wide := _hardly_known(report):
-        reason = phrase("gate, open", listed(wide))
+        reason = f"the trials hardly tell {listed(wide)}; {MORE}"
         return Gate("NOT_ENOUGH_DATA", reason, {"parameters": wide})
     p = report.probabilities.get(NONE, 1.0)
     if p < likely:
         other = max(report.probabilities, key=report.probabilities.__getitem__)
-        reason = phrase("gate, likelier", other, stated(p))
+        reason = f"no alarm, though {other} is likelier ({stated(p)} for none); {MORE}"
         return Gate("NOT_ENOUGH_DATA", reason, {"effects": [other]})
-    reason = phrase("gate, ships", num, number(before))
-    return Gate("SHIP", reason, {"scored": num, **errors})
+    before, after = report.rmse
+    reason = f"the simulator predicts {num} trials that had no part in its fit, with a "
+    reason += f"root mean square error of {number(before)}"
+    return Gate("SHIP", reason, {"scored": num, "before": before, "after": after})
+
+
+def _worst(report: Contents) -> dict[str, Any]:
+    """Return the trial with the largest residuals."""
+    table = report.residuals_by_trial.head(1).dropna(axis="columns")
+    return next(iter(table.to_dict("records")), {})
 
 
 def _beyond_prior(report: Contents, level: float, *, kept: float = 0.1) -> Gate | None:
@@ -129,46 +135,42 @@ def _beyond_prior(report: Contents, level: float, *, kept: float = 0.1) -> Gate 
     """
     bounds = report.tracing.bounds
     explains = bool(bounds.replaces) or bounds.p_value > level
-    found = {(p.name, p.side): p for p in bounds.parameters if p.model == NONE}
+    found = [p for p in bounds.parameters if p.model == NONE]
     if not (found and explains and report.detection.alarm):
         return None
-    box: dict[str, dict[str, float]] = {}
-    for (name, side), p in found.items():
+    box, said, ends = dict[str, dict[str, float]](), list[str](), list[str]()
+    for p in found:
         wider = p.bound + 2 * (p.beyond - p.bound)  # as much again beyond the fit
-        box.setdefault(name, {})[side] = (
-            wider if wider * p.bound >= 0 else kept * p.bound
-        )
-    said = [f"{n} at its {side} bound {p.bound:.6g}" for (n, side), p in found.items()]
-    ends = [f"{name}: {v:.4g}" for name, side in box.items() for v in side.values()]
-    reason = phrase("gate, bounds", listed(said), ", ".join(ends))
-    details = {"bounds": [asdict(p) for p in found.values()], "box": box}
-    return Gate("OUT_OF_PRIOR", reason, details)
+        wider = wider if wider * p.bound >= 0 else kept * p.bound
+        box.setdefault(p.name, {})[p.side] = wider
+        said.append(f"{p.name} at its {p.side} bound {p.bound:.6g}")
+        ends.append(f"{p.name}: {wider:.4g}")
+    reason = f"{listed(said)}, and with a wider prior no effect is needed; widen it to "
+    details = {"bounds": [*map(asdict, found)], "box": box}
+    return Gate("OUT_OF_PRIOR", reason + ", ".join(ends), details)
 
 
-def _wrong(report: Contents, errors: dict[str, float], worst: dict[str, Any]) -> Gate:
+def _wrong(report: Contents) -> Gate:
     """Return that effects do not lower the error, or that something is missing."""
     tracing, effects = report.tracing, [*report.tracing.chosen]
-    no_better = not errors["after"] < errors["before"]
-    if tracing.refuted or (effects and no_better):
-        before, after = tracing.refuted or (errors["before"], errors["after"])
+    before, after = tracing.refuted or report.rmse
+    errors = f"{number(before)} to {number(after)}"
+    details = {"effects": effects, "before": before, "after": after}
+    if tracing.refuted or (effects and not after < before):
         name = tracing.instead_of or str(ModelKey(tracing.chosen))
-        reason = phrase("gate, no better", name, number(before), number(after))
-        details = {"effects": effects, "before": before, "after": after}
-        return Gate("NO_IMPROVEMENT", reason, details)
-    others = not_told_from(tracing, effects)
+        reason = f"{name} does not lower the error on trials that had no part in the "
+        return Gate("NO_IMPROVEMENT", f"{reason}fit: {errors}", details)
+    others, worst = not_told_from(tracing, effects), _worst(report)
     if effects and not tracing.beside:
-        lacks = report.verdict
-        if others:
-            lacks += (
-                f", or {', '.join(others)}, which no permitted action tells from it"
-            )
-        reason = phrase("gate, lacks", lacks, *map(number, errors.values()))
+        which = "which no permitted action tells from it"
+        also = f", or {', '.join(others)}, {which}" if others else ""
+        reason = f"the simulator lacks {report.verdict}{also}; with it the error goes "
+        reason += f"from {errors}; add it and ask again"
     else:
         helping = f"; {ModelKey(tracing.beside)} helps" if tracing.beside else ""
-        trial = worst["worst"]["trial"]
-        reason = phrase("gate, misses", report.verdict, helping, trial)
-    details = {"effects": effects, "or": others, **errors, **worst}
-    return Gate("WRONG_MODEL", reason, details)
+        reason = f"the simulator misses the trials ({report.verdict}){helping}; most "
+        reason += f"in trial {worst['trial']}"
+    return Gate("WRONG_MODEL", reason, {**details, "or": others, "worst": worst})
 
 
 def _hardly_known(report: Contents, *, limit: float = 0.5) -> list[str]:

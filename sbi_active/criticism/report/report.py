@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import asdict, fields, replace
 from pathlib import Path
 from typing import Any
@@ -11,22 +10,20 @@ import cloudpickle
 
 from sbi_active.actions import ActionSpace
 from sbi_active.criticism.data.trials import Trials
+from sbi_active.criticism.misfit.evaluation import evaluate_held_out
+from sbi_active.criticism.next_trial.severe_tests import severe_tests
 from sbi_active.criticism.report.cautions import cautions
 from sbi_active.criticism.report.contents import Contents
 from sbi_active.criticism.report.figures import figures
 from sbi_active.criticism.report.gate import Gate, gate_of
-from sbi_active.criticism.report.sections import (
-    cautions_with_codes,
-    page,
-    sentences,
-    verdict_line,
-)
-from sbi_active.criticism.report.words import number
+from sbi_active.criticism.report.sections import cautions_with_codes, head, page
+from sbi_active.criticism.report.tables import tables_of
+from sbi_active.criticism.results import NONE, Evaluation
+from sbi_active.criticism.steps.predictive import find_residuals
 from sbi_active.display.figures import legible
 from sbi_active.display.notebook import card, items, table
-from sbi_active.display.table import Table
-from sbi_active.messages import Message
 from sbi_active.plain import plain
+from sbi_active.progress import stage
 
 
 class Report(Contents):
@@ -39,20 +36,18 @@ class Report(Contents):
         return page(self).text()
 
     def __repr__(self) -> str:
-        return f"Report({verdict_line(self)!r})"
+        return f"Report({head(self)[0]!r})"
 
     def _repr_html_(self) -> str:
-        scored = self.before_after[["metric", "before", "after", "ratio"]]
-        errors = [(n, *map(number, row)) for n, *row in scored.itertuples(index=False)]
-        shares = self.probabilities if self.has_probabilities else {}
-        likely = sorted(shares.items(), key=lambda item: -item[1])[:5]
+        line, *sentences = head(self)
+        tables = tables_of(self)
+        names = [
+            name for name in ("Effects", "Error before and after") if name in tables
+        ]
         return card(
-            verdict_line(self),
-            " ".join(sentences(self)),
-            table(
-                Table(("model", "probability"), [(n, f"{p:.2f}") for n, p in likely])
-            ),
-            table(Table(("metric", "before", "after", "ratio or difference"), errors)),
+            line,
+            " ".join(sentences),
+            *[table(tables[name]) for name in names],
             items([f"{code} {said}" for code, said in cautions_with_codes(self)]),
         )
 
@@ -79,7 +74,7 @@ class Report(Contents):
             {
                 "verdict": self.verdict,
                 "line": made.title,
-                "summary": sentences(self),
+                "summary": head(self)[1:],
                 "warnings": cautions_with_codes(self),
                 "chosen": self.tracing.chosen,
                 # By the fitted trials alone they would contradict the verdict.
@@ -124,13 +119,61 @@ class Report(Contents):
         return directory / "report.html"
 
 
-def build_report(
+def report_of(
+    loop: Any,
+    evaluation: Evaluation | None,
+    held_out: Trials | None,
     *,
+    plan: bool,
+    **options: bool,
+) -> Report:
+    """Return the report of all steps of a comparison.
+
+    Args:
+        loop: The steps, a :class:`.Criticism`.
+        evaluation: Error before and after; None leaves it out.
+        held_out: Trials that had no part in them.
+        plan: Whether to plan the next action, as in :meth:`.Criticism.report`.
+        **options: Whether it is ``designed`` or ``exploratory``, as there.
+    """
+    tracing = loop.judged(evaluation)
+    is_withdrawn = tracing.refuted is not None or bool(tracing.bounds.replaces)
+    if is_withdrawn and evaluation is not None and held_out is not None:
+        evaluation = evaluate_held_out(loop.rivals, tracing, held_out)
+    simulator, prior = loop.add(tracing.chosen)
+    space = loop.actions if plan else None
+    next_action = None if space is None else loop.next_action()
+    with stage("residuals and tests", show_progress=loop.show_progress):
+        residuals, after = loop.residuals(), None
+        if tracing.verdict != NONE:
+            after = find_residuals(loop.rivals, tracing.key)
+        tests = () if space is None else severe_tests(loop.rivals, tracing, space)
+    return build_report(
+        loop.trials,
+        loop=loop,
+        residuals=residuals,
+        residuals_after=after,
+        detection=loop.detect(),
+        tracing=tracing,
+        simulator=simulator,
+        prior=prior,
+        evaluation=evaluation,
+        next_action=next_action,
+        actions=loop.actions,
+        digest=loop.digest,
+        num_simulations=loop.rivals.simulator.num_simulations,
+        severe_tests=tests,
+        **options,
+    )
+
+
+def build_report(
     trials: Trials,
+    *,
     actions: ActionSpace | None = None,
     designed: bool = False,
     exploratory: bool = False,
-    warnings: Sequence[str] = (),
+    loop: Any = None,
     **parts: Any,
 ) -> Report:
     """Put the parts together, and find what a reader must be warned of.
@@ -138,9 +181,9 @@ def build_report(
     Args:
         trials: The measured trials.
         actions: Permitted actions, for names and units.
-        designed: Actions were chosen for their information.
-        exploratory: Whether what was frozen was changed afterwards.
-        warnings: Further warnings.
+        designed: Whether the actions were chosen for their information.
+        exploratory: Whether what was frozen was changed after the data were seen.
+        loop: The comparison, as in :func:`.cautions`.
         **parts: Parts of :class:`.Contents`.
     """
     labels = [f"action {i + 1}" for i in range(trials.action.shape[1])]
@@ -159,8 +202,9 @@ def build_report(
         action_is_label=trials.action_is_label,
         channel_names=None if channels is None else tuple(channels),
     )
-    found = cautions(report, trials, designed=designed)
-    return replace(report, warnings=(*found, *map(Message, warnings)))
+    return replace(
+        report, warnings=cautions(report, trials, designed=designed, loop=loop)
+    )
 
 
 def _restored(parts: bytes) -> Report:

@@ -6,12 +6,7 @@ from collections.abc import Collection
 
 from sbi_active.criticism.forces.library import COUPLING, FAMILY
 from sbi_active.criticism.report.contents import Contents
-from sbi_active.criticism.report.words import (
-    listed,
-    number,
-    probability,
-    stated,
-)
+from sbi_active.criticism.report.words import blocks, listed, number, stated
 from sbi_active.criticism.results import (
     NONE,
     OUTLIER,
@@ -40,33 +35,7 @@ def verdict_in_words(report: Contents) -> str:
 
 def misfit_line(verdict: str, misfit: Misfit) -> str:
     """Return the verdict where every model misses: what is named, or what helps."""
-    if not misfit.helps:
-        return "unexplained: the model misses the trials, and no declared effect helps"
-    if not misfit.named:
-        return (
-            f"unexplained: {ModelKey(misfit.helps)} predicts better, and is not named "
-            "as the cause"
-        )
-    first, *others = misfit.named
-    numbers = {
-        name: f"inclusion {probability(misfit.support[name].inclusion)}, leaves "
-        f"{100 * misfit.support[name].remains:.0f} % of the excess"
-        for name in misfit.named
-    }
-    family = misfit.open_forms.get(first)
-    if family and not others:
-        line = f"{family}, form open: nearest is {first} ({numbers[first]})"
-    elif others:
-        forms = {name: f"{f}, form open; " for name, f in misfit.open_forms.items()}
-        each = [f"{name} ({forms.get(name, '')}{numbers[name]})" for name in numbers]
-        line = f"{verdict}, probably the cause: {', '.join(each)}"
-    else:
-        line = f"{verdict}, probably the cause ({numbers[first]})"
-    # An effect that imitates one that was not declared leaves something of it.
-    line += "" if misfit.passes else f", beside {UNDECLARED}"
-    rest = [n for n in misfit.helps if n not in misfit.named]
-    verb = "helps" if len(rest) == 1 else "help"
-    return line + (f"; {', '.join(rest)} {verb} to predict" if rest else "")
+    return blocks("verdict", verdict=verdict, misfit=misfit, undeclared=UNDECLARED)[0]
 
 
 def _open_form(tracing: Tracing) -> str | None:
@@ -87,20 +56,6 @@ def _open_form(tracing: Tracing) -> str | None:
     told = [f"{name} ({stated(share)})" for name, share in forms if share >= 0.01]
     cause = " and ".join(sorted(chosen))
     return f"{cause} ({stated(sum(shares.values()))}), form open: {', '.join(told)}"
-
-
-def limits(tracing: Tracing) -> str:
-    """Return the trials that a verdict is about or rests on, and what it withdraws."""
-    withdrawn = tracing.instead_of
-    if tracing.bounds.replaces:
-        return f", and not {withdrawn}: {narrow_prior(tracing)}"
-    if tracing.misfit is not None and tracing.refuted and tracing.verdict != OUTLIER:
-        where = tracing.refuted_on or NO_PART
-        return f": {withdrawn} does not lower the error on {where}"
-    about = f": {suspects_in_words(tracing)}" if tracing.verdict == OUTLIER else ""
-    about += f", and not {withdrawn}" if withdrawn else ""
-    which = ", which " if withdrawn else ", "
-    return about + (f"{which}{rests(tracing)}" if tracing.needed else "")
 
 
 def rests(tracing: Tracing) -> str:
@@ -135,14 +90,9 @@ def not_told_from(tracing: Tracing, names: Collection[str]) -> list[str]:
     return sorted(frozenset().union(*groups).difference(names))
 
 
-def suspects(tracing: Tracing) -> tuple[float, ...]:
-    """Return the indices of trials that hold 90 % of a gross error's probability."""
-    return credible_set(tracing.outliers)
-
-
 def suspects_in_words(tracing: Tracing) -> str:
-    """Return the trials of which one may have a gross error."""
-    names = [_called(tracing, index) for index in suspects(tracing)]
+    """Return the trials that hold 90 % of the probability of a gross error."""
+    names = [_called(tracing, index) for index in credible_set(tracing.outliers)]
     return f"trial {listed(names, 'or')}" if names else "one trial"
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from math import inf, isnan
 from typing import Any
 
@@ -10,6 +11,7 @@ from sbi_active.criticism.report.figures import METRICS
 from sbi_active.criticism.report.summary import added, label, sizes
 from sbi_active.criticism.report.words import number, probability, with_error
 from sbi_active.criticism.results import NONE
+from sbi_active.criticism.under_misfit import Misfit
 from sbi_active.display.table import Table
 
 
@@ -21,59 +23,74 @@ def shown(report: Contents) -> list[dict[str, Any]]:
 
 def tables_of(report: Contents) -> dict[str, Table]:
     """Return the tables of the sections by their titles."""
+    misfit, scored = report.tracing.misfit, report.evaluation
     found = {"Effects": _effects(report), "Residuals": _by_trial(report)}
-    misfit, header = report.tracing.misfit, ["metric", "before", "after"]
+    found["Parameters"] = _parameters(report)
     if misfit is not None:
-        found["Models that predict"] = Table(
-            ["model", "share", f"left-out {misfit.left_out}", "excess that remains"]
-            + ["held-out trials"] * any(m.held_out is not None for m in misfit.models),
-            [
-                [
-                    m.name,
-                    probability(m.probability) if m.probability > 0 else "not admitted",
-                    sizes(report, m.left_out),
-                    f"{100 * m.remains:.0f} %",
-                    *([] if m.held_out is None else [sizes(report, m.held_out)]),
-                ]
-                for m in misfit.models
-            ],
-        )
-    if report.evaluation is not None:
-        rows = [
-            (
-                METRICS.get(name, name),
-                *map(number, (before, after, ratio)),
-                "" if interval is None else " to ".join(map(number, interval)),
-            )
-            for name, before, after, ratio, interval in report.before_after.to_numpy()
-        ]
-        header = [*header, "ratio or difference", "90 % interval"]
-        found["Error before and after"] = Table(header, rows)
-    units = {e.name: f" [{e.units}]" for e in report.tracing.estimates if e.units}
-    evidences = report.tracing.evidences
-    models = [evidences.get(name) for name in (NONE, report.tracing.model)]
-    draws = [inf if e is None else e.effective_sample_size for e in models]
-    rows = [
-        (
-            n + units.get(n, ""),
-            with_error(a, a_sd, draws[0]),
-            with_error(b, b_sd, draws[1]),
-        )
-        for n, a, a_sd, b, b_sd in report.parameters.to_numpy()
+        found["Models that predict"] = _models(report, misfit)
+    if scored is not None:
+        header = ["metric", "before", "after", "ratio or difference", "90 % interval"]
+        found["Error before and after"] = Table(header, [*_errors(report)])
+    header = ["trial", "predicted (90 %)", "measured", "prediction", "verdict before"]
+    found["Predicted, then measured"] = Table([*header, "after"], [*_tested(report)])
+    return found
+
+
+def small_sets(report: Contents) -> list[str]:
+    """Return the sets of effects that have no share."""
+    tracing = report.tracing
+    return [
+        name
+        for name, p in tracing.probabilities.items()
+        if tracing.has_several(name) and p < 0.01 and name != tracing.model
     ]
-    header = ["parameter", "bare model", f"with {added(report)}"]
-    found["Parameters before and after"] = Table(header, rows)
-    found["Parameters"] = Table(header[:2], [row[:2] for row in rows])
+
+
+def _models(report: Contents, misfit: Misfit) -> Table:
+    """Return the admitted models with their errors."""
+    header = ["model", "share", f"left-out {misfit.left_out}", "excess that remains"]
+    rows = [
+        [
+            m.name,
+            probability(m.probability) if m.probability > 0 else "not admitted",
+            sizes(report, m.left_out),
+            f"{100 * m.remains:.0f} %",
+            *([] if m.held_out is None else [sizes(report, m.held_out)]),
+        ]
+        for m in misfit.models
+    ]
+    has_held_out = any(m.held_out is not None for m in misfit.models)
+    return Table(header + ["held-out trials"] * has_held_out, rows)
+
+
+def _errors(report: Contents) -> Iterator[Sequence[str]]:
+    for name, *values, interval in report.before_after.to_numpy():
+        ends = "" if interval is None else " to ".join(map(number, interval))
+        yield METRICS[name], *map(number, values), ends
+
+
+def _parameters(report: Contents) -> Table:
+    """Return parameters of the bare model, and of the verdict's where it has more."""
+    tracing, num = report.tracing, 1 + (report.verdict != NONE)
+    units = {e.name: f" [{e.units}]" for e in tracing.estimates if e.units}
+    models = [tracing.evidences.get(name) for name in (NONE, tracing.model)]
+    draws = [inf if e is None else e.effective_sample_size for e in models]
     rows = []
+    for name, *values in report.parameters.to_numpy():
+        pairs = zip(values[::2], values[1::2], draws, strict=True)
+        each = [with_error(mean, sd, of) for mean, sd, of in pairs]
+        rows.append((name + units.get(name, ""), *each[:num]))
+    header = ["parameter", "bare model", f"with {added(report)}"]
+    return Table(header[: 1 + num], rows)
+
+
+def _tested(report: Contents) -> Iterator[Sequence[str]]:
     for trial in report.tested:
         own = trial.registered
         held = "held" if trial.held else f"failed, {trial.distance:.2g} deviations"
         held = held if trial.is_measured else "no measurement"
         name = f"{own.index:g}: {report.setting(own.action)}"
-        rows.append((name, *trial.in_words(), held, own.verdict, trial.after))
-    header = ["trial", "predicted (90 %)", "measured", "prediction", "verdict before"]
-    found["Predicted, then measured"] = Table([*header, "after"], rows)
-    return found
+        yield name, *trial.in_words(), held, own.verdict, trial.after
 
 
 def _effects(report: Contents) -> Table:
@@ -97,10 +114,8 @@ def _effects(report: Contents) -> Table:
             phi = f"{', '.join(each)} {e.units}".strip()
         if evidence is not None:
             gain = evidence.log_evidence - null
-            fit = [
-                f"{round(gain, 1) + 0.0:.1f}",
-                f"{evidence.effective_sample_size:.0f}",
-            ]
+            draws = f"{evidence.effective_sample_size:.0f}"
+            fit = [f"{round(gain, 1) + 0.0:.1f}", draws]
         any_set = probability(tracing.inclusion.get(name, p)) if e else ""
         inside = "yes" if name in tracing.credible_set else ""
         cells = [label(tracing, name), *[probability(p)] * has_p, *[any_set] * has_sets]
@@ -127,13 +142,3 @@ def _by_trial(report: Contents) -> Table:
         rows.append((one["trial"], size, number(one["deviations"]), ", ".join(where)))
     of = "the prediction" if report.tracing.misfit is None else "the sensor"
     return Table(["trial", "in units of x", f"in deviations of {of}", "largest"], rows)
-
-
-def small_sets(report: Contents) -> list[str]:
-    """Return the sets of effects that have no share."""
-    tracing = report.tracing
-    return [
-        name
-        for name, p in tracing.probabilities.items()
-        if tracing.has_several(name) and p < 0.01 and name != tracing.model
-    ]

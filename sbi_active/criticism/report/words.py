@@ -1,11 +1,10 @@
-"""Fixed texts of a report, and numbers and names as it writes them."""
+"""Templates of a report, and numbers and names as it writes them."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Sequence
 from functools import cache
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,28 +12,26 @@ import numpy as np
 from sbi_active.arrays import Array
 from sbi_active.criticism.data.units import split
 from sbi_active.criticism.results import FEW_DRAWS
+from sbi_active.display.page import environment
+
+
+def blocks(template: str, **values: Any) -> list[str]:
+    """Return what a template says: paragraphs, items and titles, a line each.
+
+    Args:
+        template: Name of the template, without its ending.
+        **values: Values of its names.
+    """
+    text = _templates().get_template(f"{template}.jinja").render(values)
+    return [" ".join(b.split()) for b in re.split(r"\n\s*\n", text) if b.strip()]
 
 
 @cache
-def _texts() -> dict[str, str]:
-    text = Path(__file__).with_name("texts.md").read_text(encoding="utf-8")
-    found = re.findall(r"^### (.+)\n((?:.+\n)+)", text, re.MULTILINE)
-    return {key: " ".join(words.split()) for key, words in found}
-
-
-def phrase(key: str, *found: Any) -> str:
-    """Return a text of ``texts.md`` with what was found in it.
-
-    Args:
-        key: Title of a section, or code of a caution.
-        *found: Values for its braces.
-    """
-    return _texts()[key].format(*found)
-
-
-def caution(code: str, *found: Any) -> str:
-    """Return a caution with its code in front, as in :func:`phrase`."""
-    return f"{code} {phrase(code, *found)}"
+def _templates() -> Any:
+    made = environment("sbi_active.criticism", "report")
+    for form in (number, probability, stated, listed, counted):
+        made.filters[form.__name__] = form
+    return made
 
 
 def stated(value: float) -> str:

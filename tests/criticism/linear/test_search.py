@@ -57,7 +57,6 @@ def loop():
         Trials(action, x, index=index),
         effects=EFFECTS,
         seed=0,
-        summaries=0,
     )
 
 

@@ -176,7 +176,7 @@ def trials(*, quadratic: float = 0.0, step: float = 0.0, hidden: float = 0.0) ->
 
 def loop(own: Trials, **options) -> Criticism:
     model = SimulatorModel(line, noise=GaussianNoise(SCALE), batched=True)
-    return Criticism(model, PRIOR, own, effects=EFFECTS, seed=0, summaries=0, **options)
+    return Criticism(model, PRIOR, own, effects=EFFECTS, seed=0, **options)
 
 
 @pytest.fixture(scope="module")
@@ -268,7 +268,7 @@ def test_held_out_errors_are_told_number_by_number_as_left_out_ones_are():
     role = ["fit"] * NUM_TRIALS + ["held out"] * 8
     model = SimulatorModel(both, noise=GaussianNoise(SCALE * unit), batched=True)
     own = Trials(action, x, role=role)
-    misfit = Criticism(model, PRIOR, own, effects=EFFECTS, summaries=0).trace().misfit
+    misfit = Criticism(model, PRIOR, own, effects=EFFECTS).trace().misfit
     for found in misfit.models:
         held_out = found.held_out / unit.numpy()
         assert held_out.max() < 2 * held_out.min()

@@ -20,7 +20,7 @@ from sbi_active.criticism.report.figures import (
     plot_probabilities,
     plot_residuals,
 )
-from sbi_active.criticism.report.sections import sentences
+from sbi_active.criticism.report.sections import head
 from sbi_active.criticism.report.words import with_error
 from tests.criticism.report.reports import DRAG, flat, report, residuals, tracing
 from tests.display.parsed import Parsed
@@ -51,6 +51,16 @@ def test_only_a_bare_model_that_holds_is_a_stop():
     assert "Stop: of the declared models only none is left." in text
     text = flat(report(next_action=alone))
     assert "Of the declared models only drag is left." in text
+
+
+def test_a_verdict_that_is_not_the_likeliest_model_says_why():
+    shares = {"scatter": 0.11, "tilt": 0.46, "drag": 0.43}
+    made = tracing("scatter", probabilities=shares, credible_set=("tilt", "drag"))
+    assert str(report(tracing=made)).splitlines()[0] == (
+        "Verdict: scatter (P = 0.11), though tilt is likelier (P = 0.46), which is not "
+        "shown to predict other trials better"
+    )
+    assert "likelier" not in str(report())
 
 
 def test_a_deviation_needs_draws_behind_it():
@@ -88,7 +98,7 @@ def test_a_report_goes_through_json_with_all_sections():
     made = report(severe_tests=TESTS)
     again = json.loads(json.dumps(made.to_dict(), allow_nan=False))
     assert again["verdict"] == "drag"
-    assert " ".join(again["summary"]) == " ".join(sentences(made))
+    assert " ".join(again["summary"]) == " ".join(head(made)[1:])
     assert again["next_action"]["action"] == [3.0]
     assert len(again["residuals_by_trial"]) == 8
     titles = [section["title"] for section in again["sections"]]
@@ -157,7 +167,7 @@ def rows_in_order(rows):
 @pytest.mark.parametrize("shape", [(1,), (6,)])
 def test_every_residual_is_drawn_at_its_action_its_trial_and_its_channel(shape):
     before, after = residuals(shape, size=4.0), residuals(shape)
-    figure = plot_residuals(before, after, added="a gain")
+    figure = plot_residuals(before, after, action_labels=["speed"], added="a gain")
     columns = 2 if shape == (1,) else 3
     assert len(figure.axes) == 2 * columns
     for row, (made, color, title) in enumerate(
