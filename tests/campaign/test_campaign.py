@@ -313,18 +313,3 @@ def test_what_is_said_outlives_the_process(tmp_path):
     assert repr(loaded) == "Campaign(asbi, 1 trials)"  # nothing was read yet
     assert loaded.belief.diagnostics.combinations == said  # pyright: ignore
     assert repr(loaded) == f"Campaign(asbi, 1 trials; {said})"
-
-
-@pytest.mark.parametrize(
-    ("options", "text"),
-    [
-        ({"estimator": "foo"}, "expected .*estimator"),
-        ({"refine": 3}, "expected refine of class bool; got 3"),
-        ({"stop": 3}, "expected stop of class StopRules; got 3"),
-        ({"details": {}}, "expected details of class CampaignDetails"),
-        ({"refinement": None}, "expected refinement of class RefinementOptions"),
-    ],
-)
-def test_options_of_another_kind_are_refused_at_once(options, text):
-    with pytest.raises(ValueError, match=text):
-        CampaignOptions(**options)

@@ -234,11 +234,6 @@ def test_another_prior_or_space_is_refused(tmp_path):
             Campaign.load(tmp_path / name, prior=prior, actions=wider)
 
 
-def test_effects_of_another_class_are_named():
-    with pytest.raises(ValueError, match="effects of class Effect; got 'drag'"):
-        new(effects=["drag"])
-
-
 def test_adopted_effects_come_back(tmp_path):
     campaign = new(tmp_path / "c", simulator=MODEL, effects=[BIAS])
     for index, action in enumerate(torch.linspace(0.5, 2.0, 4)):
