@@ -17,6 +17,7 @@ from sbi_active.campaign.storage.directory import BELIEF, SAVED, Storage
 from sbi_active.campaign.telling import STATE
 from sbi_active.expected import require
 from sbi_active.messages import warn
+from sbi_active.seeding import forked_generators
 from sbi_active.simulation.bank.errors import whole
 from sbi_active.simulation.fingerprint import fingerprint, require_same
 
@@ -71,7 +72,7 @@ def load(
 
     def saved(model: Any) -> Any:
         known = {"simulator": model, "prior": prior}
-        belief = _again(BELIEF, lambda: _decoded(content, known))
+        belief = _again(BELIEF, lambda: _sampled(_decoded(content, known)))
         state.is_stale |= belief is None and bool(state.processed)
         return belief or prior
 
@@ -130,6 +131,19 @@ _settings = functools.partial(fingerprint, version="settings")
 
 def _decoded(content: bytes | None, known: Mapping[str, Any] | None = None) -> Any:
     return decode(content, known=known or {}) if content else None
+
+
+def _sampled(belief: Any) -> Any:
+    """Return a belief that gives draws: of other code it may lack attributes."""
+    if belief is not None:
+        try:
+            with forked_generators(0):
+                belief.sample(torch.Size([1]))
+        except (AttributeError, TypeError) as error:
+            raise ValueError(
+                f"expected a belief of this release; got {error}"
+            ) from error
+    return belief
 
 
 def _again(what: str, read: Callable[[], Any]) -> Any:

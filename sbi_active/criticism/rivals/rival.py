@@ -157,7 +157,7 @@ class Rival:
             return self.noise.start
         return self.noise.whitener(self.residual(u)[0][0])
 
-    def log_likelihood(self, u: Array, *, floor: float = -np.inf) -> Array:
+    def log_likelihood(self, u: Array, *, floor: float | Array = -np.inf) -> Array:
         """Return log p(x | z), shape (n,); all trials are simulated at once."""
         if not len(u):
             return np.zeros(0)

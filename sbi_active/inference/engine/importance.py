@@ -170,7 +170,8 @@ class ImportanceSampling:
                 self.best, latched = max(self.best, efficiency), 0.0
                 pool.restart()
                 proposal = self._fitted(power, efficiency)
-            floor = float(pool.log_likelihood.max()) - own.negligible / power
+            best = float((pool.log_prior + pool.log_likelihood).max())
+            floor = best - own.negligible / power
             pool.add(proposal, proposal.sample(size, self.rng), potential, floor)
         if most.effective > (last := pool.rest).effective:
             pool.rest_on(most)

@@ -70,7 +70,7 @@ class LearnedPotential:
         """Return the log density of u under the prior, shape (n,)."""
         return self.coordinates.log_prior(u)
 
-    def log_likelihood(self, u: Array, *, floor: float = -np.inf) -> Array:
+    def log_likelihood(self, u: Array, *, floor: float | Array = -np.inf) -> Array:
         """Return learned log likelihoods, shape (n,)."""
         return self.learned.log_likelihood(self.coordinates.to_z(u))
 

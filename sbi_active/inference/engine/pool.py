@@ -186,13 +186,18 @@ class Pool:
             proposal: Proposal that they were drawn from.
             drawn: The draws.
             potential: Potential of all trials.
-            floor: Log likelihood below which a draw is given up.
+            floor: Log of prior times likelihood below which a draw is given up. Where
+                the prior excludes the best fit, the posterior lies far below the
+                likelihood's peak.
             is_final: Whether the posterior rests on them.
         """
         u = potential.simulated(drawn)
-        log_likelihood = potential.log_likelihood(u, floor=floor)
+        log_prior = potential.log_prior(u)
+        log_likelihood = potential.log_likelihood(u, floor=floor - log_prior)
         counts = np.isfinite(log_likelihood)
-        u, log_likelihood = u[counts], log_likelihood[counts]
+        u, log_likelihood, log_prior = (
+            v[counts] for v in (u, log_likelihood, log_prior)
+        )
         own = np.log(len(drawn)) + proposal.log_prob(self.u)
         self.log_mixture = np.logaddexp(self.log_mixture, own)
         count = len(drawn)
@@ -204,7 +209,7 @@ class Pool:
         log_mixture = np.logaddexp(log_mixture, np.log(count) + log_own)
         self.proposals.append((count, proposal))
         self.u = np.concatenate([self.u, u])
-        self.log_prior = np.concatenate([self.log_prior, potential.log_prior(u)])
+        self.log_prior = np.concatenate([self.log_prior, log_prior])
         self.log_likelihood = np.concatenate([self.log_likelihood, log_likelihood])
         self.log_mixture = np.concatenate([self.log_mixture, log_mixture])
         self.log_own = np.concatenate([self.log_own, log_own])

@@ -173,7 +173,7 @@ class SimulatedLikelihood:
         self,
         theta: Tensor,
         *,
-        floor: float = -np.inf,
+        floor: float | Array = -np.inf,
         first: int = 0,
         last: int | None = None,
     ) -> Array:
@@ -182,7 +182,7 @@ class SimulatedLikelihood:
         Args:
             theta: Float32.
             floor: A row is given up, as -inf, and the rest of its trials are not
-                simulated, once it can no longer reach this.
+                simulated, once it can no longer reach this; one number, or one a row.
             first: The first trial to count.
             last: The one after the last to count; None counts all.
         """
@@ -234,7 +234,7 @@ class Density(Protocol):
         """Return the log density of u under the prior, shape (n,)."""
         ...
 
-    def log_likelihood(self, u: Array, *, floor: float = -np.inf) -> Array:
+    def log_likelihood(self, u: Array, *, floor: float | Array = -np.inf) -> Array:
         """Return log likelihoods, shape (n,); -inf allowed of those below a floor."""
         ...
 
@@ -334,7 +334,7 @@ class SimulatedPotential:
         self,
         u: Array,
         *,
-        floor: float = -np.inf,
+        floor: float | Array = -np.inf,
         first: int = 0,
         last: int | None = None,
     ) -> Array:
@@ -342,7 +342,7 @@ class SimulatedPotential:
 
         Args:
             u: Places.
-            floor: Value below which a place is given up, as -inf.
+            floor: Value below which a place is given up, as -inf, or one a place.
             first: Number of the first trial that counts.
             last: Number after that of the last; None counts all.
         """

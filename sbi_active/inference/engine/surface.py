@@ -191,7 +191,7 @@ class SurfacePotential:
         """Return the log density of u under the prior, shape (n,)."""
         return self.potential.log_prior(u)
 
-    def log_likelihood(self, u: Array, *, floor: float = -np.inf) -> Array:
+    def log_likelihood(self, u: Array, *, floor: float | Array = -np.inf) -> Array:
         """Return the surface's log likelihoods, shape (n,)."""
         return self.surface.log_likelihood(u)
 

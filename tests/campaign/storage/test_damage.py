@@ -14,9 +14,11 @@ import pytest
 import torch
 
 from sbi_active import Campaign
+from sbi_active.campaign.storage.codec import decode, encode
+from sbi_active.messages import StorageWarning
 from sbi_active.simulation.bank import CorruptSegmentError
 from sbi_active.simulation.bank.store import Store
-from tests.campaign.storage.campaigns import MODEL, draws, facts, go_on, new
+from tests.campaign.storage.campaigns import MODEL, PRIOR, draws, facts, go_on, new
 from tests.simulation.bank.filled import crafted, execute, flip
 
 if sys.version_info >= (3, 11):
@@ -106,6 +108,21 @@ def test_what_can_be_computed_again_is(made, folder, name):
         campaign.update()
         assert torch.equal(draws(campaign), draws(made[1]))
         campaign.close()
+
+
+def test_a_belief_of_other_code_is_computed_again(made, folder):
+    known = {"simulator": MODEL, "prior": PRIOR}
+    store = Store(folder)
+    with store.writing():
+        belief = decode(store.get("belief"), known=known)
+        del belief._defensive  # what it was called when it was stored
+        store.put("belief", 0, encode(belief, known=known))
+    store.close()
+    campaign = Campaign.load(folder, simulator=MODEL)
+    with pytest.warns(StorageWarning, match="computed again.*SA601"):
+        campaign.update()
+    assert torch.equal(draws(campaign), draws(made[1]))
+    campaign.close()
 
 
 def test_a_damaged_manifest_is_named(folder):

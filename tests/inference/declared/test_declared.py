@@ -10,7 +10,7 @@ import torch
 from sbi.utils import BoxUniform
 from scipy.stats import norm
 from torch import Tensor
-from torch.distributions import Independent, LogNormal
+from torch.distributions import Independent, LogNormal, Normal
 
 from sbi_active import Campaign, DiscreteActions, GaussianNoise, SimulatorModel
 from sbi_active.inference import RefinementOptions, refine
@@ -164,6 +164,33 @@ def test_searches_that_agree_on_a_wrong_place_go_on():
     assert found is not None
     best, truth = likelihood(c.to_theta(found.modes[:1])), task.theta_true[None]
     assert float(best[0]) > float(likelihood(truth)[0]) - 3
+
+
+@pytest.mark.parametrize("off", [0.0, 8.0])
+def test_a_prior_far_from_the_trials_is_weighed(off: float):
+    # Each of ten parameters is told by the sum of its numbers; the likelihood is as
+    # wide as the prior, and peaks ``off`` deviations from its middle.
+    dim, num = 10, 200
+    rng = np.random.default_rng(0)
+    x = torch.from_numpy(off / math.sqrt(num) + rng.standard_normal((1, dim * num)))
+
+    def repeated(theta, action):
+        return theta.repeat_interleave(num, 1) / math.sqrt(num)
+
+    prior = Independent(Normal(torch.zeros(dim), 1.0), 1)
+    simulator = SimulatorModel(repeated, noise=GaussianNoise(1.0))
+    belief = refine(simulator, prior, torch.zeros(1, 1), x, seed=0)
+    peak = x.reshape(dim, num).sum(1) / math.sqrt(num)
+    with forked_generators(0):
+        theta = belief.sample((4_000,)).double()
+    sd = math.sqrt(0.5)
+    assert theta.mean(0).numpy() == pytest.approx((peak / 2).numpy(), abs=0.15 * sd)
+    assert theta.std(0).numpy() == pytest.approx(np.full(dim, sd), rel=0.1)
+    normal = -0.5 * float((x**2).sum()) - 0.5 * dim * num * math.log(2 * math.pi)
+    log_evidence = normal + float(peak.square().sum()) / 4 - 0.5 * dim * math.log(2)
+    assert isinstance(belief, SimulatedBelief)
+    assert belief.log_evidence == pytest.approx(log_evidence, abs=0.15)
+    assert belief.diagnostics.num_simulations < 8_000
 
 
 def test_bounds_cut_a_posterior_along_thirty_axes():
