@@ -16,7 +16,7 @@ class SurfaceSettings:
 
     Attributes:
         depth: Nats below the best draw beyond which a draw is not fitted to.
-        temper: Power of the likelihood that a draw weighs in the fit. Without it cubic
+        temper: Power of its density that a draw weighs in the fit. Without it cubic
             surfaces of ten parameters lose nine tenths of their draws to far ones.
         most_degree: Degree of the polynomials at most; quadratic ones have half to nine
             tenths of the efficiency of cubic ones there.

@@ -115,7 +115,8 @@ def fitted_surface(
         None if draws are few, or have residuals without a number.
     """
     own, dim = settings, pool.u.shape[1]
-    depth = pool.log_likelihood.max() - pool.log_likelihood
+    log_target = pool.log_prior + pool.log_likelihood
+    depth = log_target.max() - log_target
     rows = np.flatnonzero(depth < own.depth)
     degrees = [
         degree
