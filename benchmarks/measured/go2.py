@@ -1,7 +1,6 @@
 """The Go2's legs: what rigid legs with friction lack, from one record in the air.
 
     python -m benchmarks measured.go2 --data DIR
-    python -m benchmarks measured.go2 --data DIR --legs FL --figures docs/measured_go2
 
 ``DIR`` holds ``go2_in_air.xml`` and ``trajectory.csv``: 13 triangles of all joints,
 from 3.0 to 0.6 s. Each leg is fitted to the first eight and judged on the five faster
@@ -33,7 +32,6 @@ from benchmarks.measured.go2_leg import (
     DATA,
     LEGS,
     Leg,
-    draw,
     read_leg,
     usual_parameters,
 )
@@ -112,23 +110,18 @@ def main(
     *,
     data: Path = DATA,
     legs: Annotated[Sequence[str], LEGS] = (*LEGS,),
-    figures: Path | None = None,
 ) -> None:
     """Run the stages that are missing from the results, and print the tables.
 
     Args:
         data: Folder of the measured set.
         legs: Names of legs.
-        figures: Folder for the figures.
     """
     every, rows = [measured(read_leg, data, name) for name in legs], stages(RESULT)
     for leg in every:
         for name, row in _stages(leg, rows):
             add(RESULT, rows, name, row)
     print(tables(rows))
-    if figures is not None:
-        for leg in every:
-            draw(rows[leg.name], leg, figures)
 
 
 def _library(
