@@ -149,7 +149,6 @@ class Leg:
         parameters: Mapping[str, Any],
         effects: Sequence[Effect],
         values: Tensor,
-        samples: int | None = None,
     ) -> Array:
         """Return the record from its first reading on, shape (n, samples, 3).
 
@@ -157,9 +156,8 @@ class Leg:
             parameters: Of ``from_mjcf``.
             effects: That the simulator has.
             values: Theta and strengths of the effects, shape (n, d).
-            samples: Number of samples; all by default.
         """
-        robot = self.robot(parameters, [self.log(0, samples or len(self.time))])
+        robot = self.robot(parameters, [self.log(0, len(self.time))])
         sizes = [len(parameters), *[effect.phi_dim for effect in effects]]
         theta, *phi = values.double().split(sizes, 1)
         model = AugmentedSimulator(robot.simulator, [*effects])

@@ -13,8 +13,7 @@ eight trials of 25 readings a joint, and the sensors' deviations; simulated tria
 those of its verdict.
 
 A verdict is right if it is the effect, or if the effect stands in a group that the
-verdict itself calls not separated from it: by no permitted action, by these trials, or
-by less than the noise.
+verdict itself calls not separated from it: by no permitted action, or by these trials.
 
 Rows (results/hidden.csv): seeds below 1000 are for tuning, the table is of seeds from
 2000 on, and those that are there are not run again. Needs dm_control and gymnasium for
