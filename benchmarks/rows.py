@@ -9,7 +9,6 @@ import csv
 import inspect
 import io
 import json
-import random
 import sys
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -255,24 +254,6 @@ def measured(read_data: Callable[..., T], *arguments: Any) -> T:
         return read_data(*arguments)
     except FileNotFoundError as error:
         raise SystemExit(f"{error}, as in --data DIR") from None
-
-
-def in_turn(
-    variants: Mapping[str, Callable[[], Any]],
-    repetitions: int,
-    clock: Callable[[], float] = time.perf_counter,
-) -> dict[str, list[float]]:
-    """Return how long each variant took in each repetition."""
-    for run in variants.values():
-        run()  # starts what it needs
-    order = random.Random(0)
-    seconds: dict[str, list[float]] = {name: [] for name in variants}
-    for _ in range(repetitions):
-        for name in order.sample([*variants], len(variants)):
-            start = clock()
-            variants[name]()
-            seconds[name].append(clock() - start)
-    return seconds
 
 
 FILE = Path(__file__).with_name("published.csv")

@@ -5,37 +5,16 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from scipy.stats import norm
-
-Z = float(norm.ppf(0.975))
-
-
-def wilson(successes: int, trials: int) -> tuple[float, float]:
-    """Return the Wilson interval of level .95 for a proportion.
-
-    Example:
-        >>> [round(end, 3) for end in wilson(0, 60)]
-        [0.0, 0.06]
-
-    References:
-        Wilson, JASA 1927.
-    """
-    if trials == 0:
-        return 0.0, 1.0
-    share, z2 = successes / trials, Z**2
-    center = (share + z2 / (2 * trials)) / (1 + z2 / trials)
-    half = Z / (1 + z2 / trials)
-    half *= np.sqrt(share * (1 - share) / trials + z2 / (4 * trials**2))
-    return max(center - half, 0.0), min(center + half, 1.0)
+from scipy.stats import binomtest
 
 
 def rate(hits: Sequence[bool] | np.ndarray) -> str:
-    """Return a proportion with its counts and interval, for a table."""
+    """Return a proportion with its counts and Wilson's 95 % interval, for a table."""
     n, k = len(hits), int(np.sum(hits))
     if n == 0:
         return "- (0 cases)"
-    low, high = wilson(k, n)
-    return f"{k / n:.3f} ({k}/{n}) [{low:.3f}, {high:.3f}]"
+    ends = binomtest(k, n).proportion_ci(method="wilson")
+    return f"{k / n:.3f} ({k}/{n}) [{ends.low:.3f}, {ends.high:.3f}]"
 
 
 def brier_score(

@@ -11,6 +11,7 @@ round in benchmarks/dear/results/rows.csv, and the table is printed.
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -20,9 +21,10 @@ import torch
 from sbi.inference import NPE_C
 from sbi.utils import RestrictedPrior, get_density_thresholder
 
-from benchmarks.rounds import drawn_truth
+from benchmarks.numerical.run import reference
+from benchmarks.rounds import drawn_truth, played
 from benchmarks.rows import benchmark, column, grouped
-from sbi_active import Campaign
+from sbi_active.campaign import Trial
 from sbi_active.display.table import Table
 from sbi_active.seeding import derive_seed, forked_generators
 from sbi_active.tasks import get_task
@@ -49,47 +51,36 @@ def campaign(task: Any, per_round: int | None, seed: int) -> list[dict[str, Any]
     options: dict[str, Any] = {"network": "on demand"}
     if per_round is not None:
         options = {"max_simulations": per_round * ROUNDS, "planned_trials": ROUNDS}
-    start = time.process_time()
-    made = Campaign(
-        task.simulator, task.prior, task.actions, seed=seed, options=options
-    )
-    spent, rows, trials = 0, [], []
-    for k in range(ROUNDS):
-        regret = None
-        trial = made.ask()
-        if task.name == "numerical":
-            before = [torch.empty(0, 1), torch.empty(0, 1)]
-            if trials:
-                before = [*map(torch.stack, zip(*trials, strict=True))]
-            gain = task.reference(*before).expected_information_gain(
-                task.actions.values
-            )
-            chosen = (task.actions.values == trial.action).all(1).int().argmax()
-            regret = float(gain.max() - gain[chosen])
-        x = task.real_system(trial.action, seed=derive_seed(seed, "real", k))
-        made.tell(x)
-        made.update()
-        trials.append((trial.action, x))
-        cpu = time.process_time() - start
+    spent, rows = 0, []
+    for made, cpu in played(task, seed, ROUNDS, options=options):
+        trial = made.history[-1]
+        trials = [(t.action, t.x) for t in made.history]
         now = sum(t.num_simulations for t in made.history)
         if per_round is not None:
             now = made.state.meter.spent
         rows.append(
             {
-                "round": k + 1,
+                "round": len(trials),
                 "action": " ".join(f"{v:g}" for v in trial.action.tolist()),
                 **figures(task, trials, made.belief),
-                "regret": regret,
+                "regret": regret(task, made.history),
                 "num_simulations": now - spent,
                 "cpu": cpu,
+                "x": trial.x,
             }
         )
-        spent, start = now, time.process_time() - cpu
-        rows[-1]["x"] = x
-    # Judging is not on the campaign's account; rows have what was spent so far.
-    for k in range(ROUNDS - 1, 0, -1):
-        rows[k]["cpu"] -= rows[k - 1]["cpu"]
+        spent = now
     return rows
+
+
+def regret(task: Any, trials: Sequence[Trial]) -> float | None:
+    """Return the exact information lost by the last action, where it is known."""
+    if task.name != "numerical":
+        return None
+    actions = task.actions.values
+    gain = reference(task, trials[:-1]).expected_information_gain(actions)
+    chosen = (actions == trials[-1].action).all(1).int().argmax()
+    return float(gain.max() - gain[chosen])
 
 
 def stock(task: Any, method: str, num: int, trials: list[Any], seed: int) -> Any:

@@ -42,14 +42,12 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.special import logsumexp
 from torch import Tensor
 
 from sbi_active.inference.sampling.mixtures import (
     Defended,
     Proposal,
     StudentMixture,
-    log_student,
 )
 from sbi_active.tasks.location_finding.model import log_likelihood
 
@@ -62,31 +60,6 @@ SHARE_OF_BASE = 0.05  # a choice: weights are then below 20 times target over ba
 #: Of each variance: a ten-thousandth of a deviation, far above what rounding leaves.
 RIDGE = 1e-8
 RESOLUTION = 1e-7  # of float32 parameters, in the prior's units
-BLOCK = 2_000  # draws at once, which bounds the memory
-
-
-class KernelMixture(StudentMixture):
-    """Many Student kernels of equal weight."""
-
-    def sample(self, num_samples: int, rng: np.random.Generator) -> Array:
-        """Return draws, shape (n, d)."""
-        which = rng.integers(len(self.means), size=num_samples)
-        normal = rng.standard_normal((num_samples, self.means.shape[1]))
-        square = rng.chisquare(self.freedom, (num_samples, 1)) / self.freedom
-        return self.moved(which, normal / np.sqrt(square))
-
-    def log_prob(self, z: Array) -> Array:
-        """Return the log density, (n, d) -> (n,)."""
-        blocks = [self._log_kernels(z[i : i + BLOCK]) for i in range(0, len(z), BLOCK)]
-        return np.concatenate([np.zeros(0), *blocks])
-
-    def _log_kernels(self, z: Array) -> Array:
-        inverse = np.linalg.inv(self.factors)
-        center = (inverse @ self.means[..., None])[..., 0]
-        step = np.tensordot(z, inverse, (1, 2)) - center  # (n, k, d)
-        log_volume = np.log(np.diagonal(self.factors, axis1=1, axis2=2)).sum(1)
-        each = log_student((step**2).sum(-1), log_volume, z.shape[1], self.freedom)
-        return np.asarray(logsumexp(each, axis=1)) - np.log(len(self.means))
 
 
 class KernelProposal(Defended):
@@ -121,7 +94,7 @@ class KernelProposal(Defended):
         # Draws that repeat may be too few for a covariance.
         covariance = local + 0.003 * overall
         factor = WIDTH * np.linalg.cholesky(covariance)
-        kernels = KernelMixture(location, factor)
+        kernels = StudentMixture(location, factor)
         return KernelProposal(kernels, base, SHARE_OF_BASE)
 
 

@@ -12,9 +12,8 @@ What the fitted samples cannot tell: the hoop turns one way only in them, so tha
 Coulomb friction is an offset of the input. A fit that is free to choose both can put
 them anywhere on a line, with one error on what was fitted and any on what was not: with
 Coulomb friction alone, plain least squares gets 2.5 to 5.5 V on the rest of the first
-record. The prior of the offset, 1 % of the largest command, is what decides
-(:mod:`benchmarks.measured.hoop_offset`). Least squares is therefore given with the
-offset at zero.
+record. The prior of the offset, 1 % of the largest command, is what decides (a table in
+``hoop.md``). Least squares is therefore given with the offset at zero.
 
 Besides friction the library has an amplifier whose gain falls with the command. Least
 squares given it alone fits better than given quadratic drag and Coulomb friction, and

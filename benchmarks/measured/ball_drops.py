@@ -4,7 +4,7 @@
 ``sbi_active.tasks.ball_drops`` with the two drops of every ball, writes one row a ball
 and one a fold to ``results/ball_drops.json``, and prints the tables. A fold is fitted
 to one drop and the first 0.8 s of the other; it chooses its own verdict, and is scored
-on the rest. Rows that are there are kept. ``--figures DIR`` draws.
+on the rest. Rows that are there are kept.
 """
 
 from __future__ import annotations
@@ -19,7 +19,6 @@ from numpy.typing import NDArray
 
 from benchmarks.measured.ball_forecast import (
     KINDS,
-    Forecast,
     aligned_error,
     forecast,
     forecast_error,
@@ -45,7 +44,6 @@ Row = dict[str, Any]
 DATA = Path("../shared/data/ball_drops")
 RESULT = Path(__file__).parent / "results" / "ball_drops.json"
 UNTIL = 0.8  # s
-DRAWN = ("bowling_ball", "blue_basketball", "yellow_whiffle_ball")
 LIKELY = 0.5  # probability of the family of drag from which it is the verdict
 NUM_BOOTSTRAP = 4_000
 WHEN = ("before", "after")
@@ -77,8 +75,8 @@ def judge(drops: Sequence[Drop]) -> Row:
     }
 
 
-def score(fitted: Drop, tested: Drop) -> tuple[Row, dict[str, Forecast]]:
-    """Return the errors on the rest of a drop, and the forecasts.
+def score(fitted: Drop, tested: Drop) -> Row:
+    """Return the errors on the rest of a drop.
 
     Args:
         fitted: Drop that is fitted whole.
@@ -105,7 +103,7 @@ def score(fitted: Drop, tested: Drop) -> tuple[Row, dict[str, Forecast]]:
     for kind in KINDS:
         row[f"forecast {kind}"] = forecast_error(fitted, tested, kind, until=UNTIL)
         row[f"second drop {kind}"] = second_drop_error(fitted, tested, kind)
-    return row | {"cpu_seconds": time.process_time() - begin}, forecasts
+    return row | {"cpu_seconds": time.process_time() - begin}
 
 
 def criticism(trials: Any) -> Criticism:
@@ -129,12 +127,11 @@ def found(tracing: Tracing) -> Row:
     }
 
 
-def main(*, data: Path = DATA, figures: Path | None = None) -> None:
+def main(*, data: Path = DATA) -> None:
     """Run what is missing from the results, and print the tables.
 
     Args:
         data: Folder of the measured set.
-        figures: Folder for the figures.
     """
     rows, by_ball = stages(RESULT), {}
     for drop in measured(read_drops, data):
@@ -144,26 +141,8 @@ def main(*, data: Path = DATA, figures: Path | None = None) -> None:
             add(RESULT, rows, ball, judge(pair))
         for k in (0, 1):
             if (key := f"{ball} {k + 1}") not in rows:
-                add(RESULT, rows, key, score(pair[1 - k], pair[k])[0])
+                add(RESULT, rows, key, score(pair[1 - k], pair[k]))
     print(tables([*rows.values()]))
-    if figures is not None:
-        _draw(rows, by_ball, figures)
-
-
-def _draw(rows: dict[str, Row], by_ball: dict[str, list[Drop]], folder: Path) -> None:
-    from benchmarks.measured.ball_forecast import draw_exponents, draw_forecasts
-
-    folder.mkdir(parents=True, exist_ok=True)
-    judged = [row for row in rows.values() if "alarm" in row]
-    shown = [row for row in judged if called(row) == "drag-like"]
-    draw_exponents(shown, folder / "exponents.png")
-    pairs = {ball.replace("_", " "): by_ball[ball] for ball in DRAWN if ball in by_ball}
-    draw_forecasts(
-        {name: score(one, two)[1] for name, (one, two) in pairs.items()},
-        {name: two for name, (_, two) in pairs.items()},
-        folder / "forecasts.png",
-        until=UNTIL,
-    )
 
 
 def tables(rows: Sequence[Row]) -> str:

@@ -1,7 +1,6 @@
 """The Go2's legs: what rigid legs with friction lack, from one record in the air.
 
     python -m benchmarks measured.go2 --data DIR
-    python -m benchmarks measured.go2 --data DIR --legs FL --figures docs/measured_go2
 
 ``DIR`` holds ``go2_in_air.xml`` and ``trajectory.csv``: 13 triangles of all joints,
 from 3.0 to 0.6 s. Each leg is fitted to the first eight and judged on the five faster
@@ -13,7 +12,7 @@ leg, which are added to ``results/go2.json`` unless they are there:
   and its encoder, and the tilt of the base; of the other legs against four of these.
 - ``FL, removed``: against these four without the effects that the first stage adopted.
 
-Beside the verdicts plain least squares, given the same effects.
+What plain least squares of the same run found stands in ``go2.md``.
 """
 
 from __future__ import annotations
@@ -24,16 +23,13 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from benchmarks.criticism.problem import counted
-from benchmarks.fitting import local_fit
 from benchmarks.measured.go2_leg import (
     DATA,
     LEGS,
     Leg,
-    draw,
     read_leg,
     usual_parameters,
 )
@@ -54,16 +50,6 @@ KINDS = ("friction loss by *", "static friction", "quadratic damping", "*stiffne
 KINDS += ("zero offset", "sensor bias", "sensor delay")
 #: The same for the other legs, and with an effect removed: what was near on the first.
 FEW_KINDS = ("friction loss by *", "static friction")
-
-
-#: Where parameters start, by the end of their names, and strengths, in deviations.
-START = {"armature": 0.02, "damping": 0.15, "frictionloss": 0.25, "scale": 0.9}
-STRENGTH = 0.3
-#: Relative step of finite differences, and evaluations of the Jacobian at most.
-DIFFERENCE, EVALUATIONS = 1e-3, 15
-#: Samples at rest, which are not compared.
-AT_REST = 17
-MILLI = 1e3
 
 
 def line_of(tracing: Tracing) -> str:
@@ -112,23 +98,18 @@ def main(
     *,
     data: Path = DATA,
     legs: Annotated[Sequence[str], LEGS] = (*LEGS,),
-    figures: Path | None = None,
 ) -> None:
     """Run the stages that are missing from the results, and print the tables.
 
     Args:
         data: Folder of the measured set.
         legs: Names of legs.
-        figures: Folder for the figures.
     """
     every, rows = [measured(read_leg, data, name) for name in legs], stages(RESULT)
     for leg in every:
         for name, row in _stages(leg, rows):
             add(RESULT, rows, name, row)
     print(tables(rows))
-    if figures is not None:
-        for leg in every:
-            draw(rows[leg.name], leg, figures)
 
 
 def _library(
@@ -152,73 +133,8 @@ def _stages(leg: Leg, rows: dict[str, Any]) -> Iterator[tuple[str, Any]]:
     if own not in rows:
         yield own, judge(leg, _library(leg, few=own != LEGS[0]))
     helps = rows[own]["helps"]
-    if (name := f"{own}, least squares") not in rows:
-        given = dict.fromkeys([(), (*helps,)])
-        yield name, _least_squares(leg, [*given])
     if (name := f"{own}, removed") not in rows:
         yield name, judge(leg, _library(leg, helps, few=True))
-
-
-def _least_squares(leg: Leg, sets: Sequence[tuple[str, ...]]) -> dict[str, Any]:
-    """Return fits of the engineer's model, given some sets of effects."""
-    parameters = usual_parameters(leg)
-    robot = leg.robot(parameters, leg.triangles())
-    names = sorted({name for each in sets for name in each})
-    effects = {e.name: e for e in mjcf_effects(robot, include=names)} if names else {}
-    found = {}
-    for each in sets:
-        found[" + ".join(each) or "none"] = fit_leg(
-            leg, parameters, [effects[name] for name in each]
-        )
-    return found
-
-
-def fit_leg(
-    leg: Leg, parameters: Mapping[str, Any], effects: Sequence[Effect]
-) -> dict[str, Any]:
-    """Return the fit of one free run over the fitted triangles, and its errors.
-
-    Args:
-        leg: Whose record it is.
-        parameters: Of ``from_mjcf``.
-        effects: That the simulator is given.
-    """
-    num = leg.split
-
-    def residual(rows: Array) -> Array:
-        x = leg.free_run(parameters, effects, torch.from_numpy(rows), num)
-        left = (x - leg.position[:num])[:, AT_REST:]
-        return np.nan_to_num(MILLI * left.reshape(len(rows), -1), nan=MILLI)
-
-    start = np.array([_start(name) for name in parameters])
-    draws = [effect.declared_draws().numpy() for effect in effects]
-    sds = np.concatenate([np.zeros(0), *[np.sqrt((d**2).mean(0)) for d in draws]])
-    low = np.zeros(len(parameters))
-    high = np.array([bounds[1] for bounds in parameters.values()], dtype=float)
-    least = [np.where((d >= 0).all(0), 0.0, -np.inf) for d in draws]
-    low, high = (
-        np.concatenate([low, *least]),
-        np.append(high, np.full(len(sds), np.inf)),
-    )
-    x0 = np.concatenate([start, STRENGTH * sds])
-    scale = np.maximum(np.abs(x0), 0.02)
-
-    found = local_fit(
-        residual,
-        x0,
-        low=low,
-        high=high,
-        scale=scale,
-        difference=DIFFERENCE,
-        evaluations=EVALUATIONS,
-    )
-    values = torch.from_numpy(found.x)[None]
-    run = leg.free_run(parameters, effects, values)[0]
-    return {"parameters": found.x.tolist(), **leg.errors(run)}
-
-
-def _start(name: str) -> float:
-    return next(value for end, value in START.items() if name.endswith(end))
 
 
 def tables(rows: Mapping[str, Any]) -> str:
@@ -230,11 +146,6 @@ def tables(rows: Mapping[str, Any]) -> str:
         errors.append((f"{name}: before", *_errors(row["before"])))
         verdicts.append((name, said(row), causes(row), *cost))
         errors.append((f"{name}: after", *_errors(row["after"])))
-    for name, row in rows.items():
-        if "line" not in row:
-            errors += [
-                (f"{name}: {given}", *_errors(fit)) for given, fit in row.items()
-            ]
     values = [
         (what, f"{mean:.3g} +- {sd:.2g}")
         for name, row in judged.items()

@@ -12,7 +12,6 @@ What the loop says of recorded trials: the one place that knows a report's layou
 from __future__ import annotations
 
 import re
-import time
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -23,10 +22,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from benchmarks.criticism.problem import counted
+from benchmarks.criticism.problem import Problem
 from benchmarks.rows import add, keep, measured, stages
 from sbi_active import SimulatorModel
-from sbi_active.criticism import Effect, Report, Trials, close_loop
+from sbi_active.criticism import Effect, Report, Trials
 from sbi_active.criticism.results import NONE, Evidence, Tracing
 from sbi_active.display.table import Table
 
@@ -66,6 +65,22 @@ def read_report(report: Report) -> dict[str, Any]:
         "log_bayes_factor": float(report.detection.log_bayes_factor),
         "warnings": [*report.warnings],
     }
+
+
+def reported(
+    model: SimulatorModel, prior: Any, trials: Trials, effects: Sequence[Effect]
+) -> tuple[Report, dict[str, Any]]:
+    """Return the report on the trials to fit, and its row.
+
+    Args:
+        model: The bare simulator.
+        prior: Prior of theta.
+        trials: Trials to fit; what is held out is scored elsewhere.
+        effects: The declared library.
+    """
+    problem = Problem(model=model, prior=prior, trials=trials, effects=[*effects])
+    report, cost = problem.counted_report(0, evaluate=False, plan=False)
+    return report, read_report(report) | cost
 
 
 def spreads(evidence: Evidence) -> dict[str, list[float]]:
@@ -216,20 +231,8 @@ def judge(
         trials: Trials in place of the recorded ones.
     """
     effects = [effect for effect in bench.effects if effect.name not in gone]
-    model, count = counted(bench.model)
-    begin = time.process_time()
-    report = close_loop(
-        model,
-        bench.prior,
-        bench.trials if trials is None else trials,
-        effects=effects,
-        seed=0,
-        evaluate=False,  # held-out records are scored in free run, below
-        plan=False,
-    )
-    seconds = time.process_time() - begin
-    row = read_report(report)
-    row |= {"cpu_seconds": seconds, "trial_simulations": count()}
+    given = bench.trials if trials is None else trials
+    report, row = reported(bench.model, bench.prior, given, effects)
     if trials is None:
         helps, evidences = report.tracing.chosen, report.tracing.evidences
         chosen = [e for name in helps for e in effects if e.name == name]

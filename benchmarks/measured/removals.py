@@ -17,7 +17,6 @@ form of a family whose form is said to be open. Each row is added to
 
 from __future__ import annotations
 
-import time
 from collections.abc import Iterator, Sequence
 from itertools import combinations
 from pathlib import Path
@@ -25,9 +24,9 @@ from typing import Any, Literal
 
 from benchmarks.measured.ball_drops import DATA as BALLS
 from benchmarks.measured.ball_drops import jobs_without_drag
-from benchmarks.measured.record_stages import causes, read_report, said, shares_left
+from benchmarks.measured.record_stages import causes, reported, said, shares_left
 from benchmarks.rows import add, measured, stages
-from sbi_active.criticism import Criticism, Effect
+from sbi_active.criticism import Effect
 from sbi_active.display.table import Table
 from sbi_active.tasks.servo_pendulum import ServoPendulumTask  # pyright: ignore
 from sbi_active.tasks.servo_pendulum.task import DATA as SERVO  # pyright: ignore
@@ -59,19 +58,12 @@ def removed(
 
     Args:
         model: The bare simulator.
-        prior: Of its parameters.
-        trials: To fit.
+        prior: Prior of its parameters.
+        trials: Trials to fit.
         effects: What is left of the library, with nuisances.
     """
-    begin = time.process_time()
-    loop = Criticism(model, prior, trials, effects=effects, seed=0)
-    report = loop.report(evaluate=False, plan=False)
-    row = read_report(report)
-    return row | {
-        "share_said": shares_left(row),
-        "cpu_seconds": time.process_time() - begin,
-        "trial_simulations": loop.rivals.simulator.num_simulations,
-    }
+    _, row = reported(model, prior, trials, effects)
+    return row | {"share_said": shares_left(row)}
 
 
 def _servo(data: Path) -> Iterator[Job]:

@@ -90,7 +90,6 @@ TABLES = {
     "The cost of a round": (
         "table cost/result.json",
         "table cost/network.json",
-        "table cost/training.json",
         "table cost/walls.json",
     ),
     "Robust updates": ("chain.robust --summary",),

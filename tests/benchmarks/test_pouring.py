@@ -2,14 +2,10 @@
 
 import numpy as np
 import pytest
-import torch
 
 pytest.importorskip("pybullet")
-from benchmarks.pouring import bank  # noqa: E402
 from benchmarks.pouring.likelihood import repeated  # noqa: E402
-from benchmarks.pouring.material import bank as material_bank  # noqa: E402
 from benchmarks.pouring.material.learned import Overlap, PointBelief  # noqa: E402
-from sbi_active.tasks import get_task  # pyright: ignore  # noqa: E402
 
 
 def test_a_repeat_tells_less_than_a_first_pour():
@@ -29,28 +25,6 @@ def test_a_repeat_tells_less_than_a_first_pour():
     same = repeated(mean, 0 * error, noise, earlier, 0.0)
     assert same[0] == 0
     assert same[1] == 1
-
-
-def test_a_bank_is_drawn_by_the_number_of_its_file():
-    task = get_task("pouring")
-    assert len(bank.draw(task, "likely", 0)[1].unique(dim=0)) == len(bank.LIKELY)
-    first, again = (bank.draw(task, "prior", 0)[0] for _ in range(2))
-    assert torch.equal(first, again)
-    assert len(first.unique(dim=0)) == bank.ROWS_A_FILE
-
-
-def test_rows_of_the_bank_are_shared_out_by_place():
-    task = get_task("pouring_real", cubes=8)
-    parts = [material_bank.draw(task, "prior", k) for k in range(8)]
-    action = torch.cat([part[1] for part in parts])
-    share = [(action[:, 1] == p).float().mean().item() for p in material_bank.PLACES]
-    assert share == pytest.approx([0.4, 0.5, 0.1], abs=0.08)
-    known = {tuple(a) for a in task.actions.values.tolist()}
-    assert {tuple(a) for a in action.tolist()} <= known
-    again = material_bank.draw(task, "prior", 0)
-    assert torch.equal(again[0], parts[0][0])
-    assert not torch.equal(parts[1][0], parts[0][0])
-    assert len(material_bank.draw(task, "compared", 0)[1].unique(dim=0)) == 1
 
 
 def test_the_volume_that_a_belief_shares_is_the_mean_over_its_draws():

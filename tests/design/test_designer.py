@@ -67,36 +67,6 @@ def test_the_choice_and_the_report_use_separate_simulations():
     assert min(best) > exact
 
 
-def test_named_parameters_are_the_target():
-    """The first action tells about one parameter, the second about the other."""
-
-    def one_at_a_time(theta, action):
-        gain = torch.tensor([8.0, 2.0])
-        return torch.where(action > 0.5, gain * theta, gain.flip(0) * theta).gather(
-            1, (action > 0.5).long()
-        )
-
-    model = SimulatorModel(
-        one_at_a_time, noise=GaussianNoise(1.0), parameter_names=["mass", "friction"]
-    )
-    designer = InformationGainDesigner(DiscreteActions([0.0, 1.0]), num_samples=400)
-
-    def select(target):
-        return designer.select(None, model, belief=PRIOR, target=target, seed=0)
-
-    mass, friction = select("mass"), select(["friction"])
-    assert (mass.action.tolist(), friction.action.tolist()) == ([0.0], [1.0])
-    assert (mass.estimator, mass.bound) == ("ParameterGain", "lower")
-    exact = torch.tensor([0.5 * torch.log1p(torch.tensor(4.0)), 0.0]).double()
-    for design, values in ((mass, exact), (friction, exact.flip(0))):
-        error = design.standard_error
-        gain = design.expected_information_gain
-        assert (gain < values + 3 * error + 0.01).all()
-        assert (gain > values - 0.15 - 3 * error).all()
-    both = select(["mass", "friction"])
-    assert (both.expected_information_gain > exact.max() - 0.3).all()
-
-
 def six_numbers(theta, action):
     mean = action * theta
     return torch.cat([mean, 2 * mean, mean], 1) + torch.randn(len(theta), 6)

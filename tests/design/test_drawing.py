@@ -61,17 +61,3 @@ def test_two_entries_make_a_map_with_every_candidate_and_the_chosen_one():
     np.testing.assert_allclose(chosen.get_xydata()[0], made.action)
     assert (ax.get_xlabel(), ax.get_ylabel()) == ("speed [m/s]", "tilt")
     assert [a.get_ylabel() for a in ax.figure.axes][1:] == ["EIG (lower bound) [nats]"]
-
-
-@pytest.mark.parametrize("dim", [7])
-def test_more_entries_are_bars_in_order_with_the_chosen_one(dim):
-    actions = BoxActions([0.0] * dim, [1.0] * dim)
-    worst = int(design(actions).expected_information_gain.argmin())
-    made = design(actions, index=worst)
-    ax = made.plot()
-    widths = [bar.get_width() for bar in ax.patches]
-    assert len(widths) == 15
-    assert widths[1:] == sorted(widths[1:])
-    assert widths[-1] == pytest.approx(float(made.expected_information_gain.max()))
-    assert widths[0] == pytest.approx(float(made.expected_information_gain.min()))
-    assert ax.get_title() == "red: chosen; 15 further candidates"

@@ -5,14 +5,11 @@ import torch
 from torch.distributions import MultivariateNormal
 
 from sbi_active import (
-    AutocorrelatedNoise,
     DiscreteActions,
     GaussianNoise,
     InformationGainDesigner,
     SimulatorModel,
 )
-from sbi_active.design.outcomes import LinearSummaries
-from sbi_active.seeding import forked_generators
 
 NUM = 300
 TIMES = torch.linspace(0.1, 1.0, NUM)
@@ -43,25 +40,3 @@ def test_a_linear_model_tells_what_it_tells_in_closed_form(num_samples: int):
     assert any(
         "32 linear summaries stand for the 300 numbers" in n for n in design.notes
     )
-
-
-@pytest.mark.parametrize(
-    "noise", [GaussianNoise(0.5), AutocorrelatedNoise(0.5, 0.2).at(TIMES)]
-)
-def test_differences_of_outcomes_keep_their_length_in_the_noise(noise):
-    with forked_generators(1):
-        theta = torch.randn(400, 2)
-    mean = line(theta, torch.tensor([[1.5]]))
-    summaries = LinearSummaries(noise)
-    short = summaries(torch.tensor([1.5]), mean)
-    whole = noise.whiten(mean)
-    assert short.shape == (400, 32)
-    torch.testing.assert_close(
-        torch.cdist(short, short), torch.cdist(whole, whole), rtol=1e-4, atol=1e-2
-    )
-    assert summaries.left_out < 1e-3
-    # What is kept of an action holds no memory of what is not.
-    ((_, own),) = summaries._known.values()
-    assert own.untyped_storage().nbytes() == own.nbytes
-    in_blocks = summaries(torch.tensor([1.5]), mean, block=64)
-    torch.testing.assert_close(in_blocks, short)

@@ -3,24 +3,23 @@
 import importlib.util
 import re
 from pathlib import Path
-from types import ModuleType
 
 import pytest
 
 ROOT = Path(__file__).parents[2]
 
 
-@pytest.fixture(scope="module")
-def page() -> ModuleType:
-    path = ROOT / "docs" / "_ext" / "results.py"
-    spec = importlib.util.spec_from_file_location("results", path)
-    module = importlib.util.module_from_spec(spec)
-    pytest.importorskip("sphinx")
-    spec.loader.exec_module(module)
-    return module
+pytest.importorskip("sphinx")
+SPEC = importlib.util.spec_from_file_location(
+    "results", ROOT / "docs" / "_ext" / "results.py"
+)
+assert SPEC is not None
+assert SPEC.loader is not None
+page = importlib.util.module_from_spec(SPEC)
+SPEC.loader.exec_module(page)
 
 
-def test_columns_end_where_their_rule_does(page):
+def test_columns_end_where_their_rule_does():
     text = (
         "           gap  regret\n"
         "----  --------  ------\n"
@@ -41,7 +40,7 @@ def test_columns_end_where_their_rule_does(page):
     ]
 
 
-def test_each_section_shows_its_tables(page):
+def test_each_section_shows_its_tables():
     text = (ROOT / "docs" / "benchmarks.md").read_text(encoding="utf-8")
     included = re.findall(r"{include} reference/api/results/(.+)", text)
     assert included == [
@@ -50,19 +49,7 @@ def test_each_section_shows_its_tables(page):
     assert {*included} == {page.file_of(title).name for title in page.TABLES}
 
 
-# Every table of the documentation is printed from its committed rows
-
-
-pytest.importorskip("sphinx")
-PATH = Path(__file__).parents[2] / "docs" / "_ext" / "results.py"
-SPEC = importlib.util.spec_from_file_location("results", PATH)
-assert SPEC is not None
-assert SPEC.loader is not None
-results = importlib.util.module_from_spec(SPEC)
-SPEC.loader.exec_module(results)
-
-
-@pytest.mark.parametrize("title", results.TABLES)
+@pytest.mark.parametrize("title", page.TABLES)
 def test_a_section_has_its_tables(title):
-    text = results.tables(results.TABLES[title])
-    assert text.count("```bash") == len(results.TABLES[title])
+    text = page.tables(page.TABLES[title])
+    assert text.count("```bash") == len(page.TABLES[title])

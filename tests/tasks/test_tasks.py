@@ -134,9 +134,8 @@ def test_log_likelihood_is_a_normal_s():
     center = locations.mean(theta, action)
     expected = Normal(center, locations.NOISE_SD).log_prob(x)[:, 0]
     torch.testing.assert_close(task.log_likelihood(x, theta, action), expected)
-    torch.testing.assert_close(
-        task.simulator.noise.log_prob(x, task.simulator.mean(theta, action)), expected
-    )
+    mean = task.simulator.mean(theta, action)
+    torch.testing.assert_close(task.simulator.noise.log_prob(x, mean), expected)
     assert task.exact_likelihood
 
 

@@ -61,7 +61,7 @@ class StageSettings:
             3,000 histories.
         known: Error of a mean by the number of simulations, in standard deviations,
             root mean square, beyond which a belief under noise that is not Gaussian is
-            not trusted. At .125, of twenty beliefs of ``dear.skewed`` at 3,000
+            not trusted. At .125, of twenty beliefs under skewed noise at 3,000
             histories all are trusted, and six have a mean that is off by more than .3:
             what is wrong with the noise's shape counts as well. This trusts none of
             them, and half none of any.

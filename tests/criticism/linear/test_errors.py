@@ -157,25 +157,6 @@ def test_left_out_errors_are_those_of_refits():
         assert left.square[k] == pytest.approx(np.mean(error**2))
 
 
-def test_a_part_that_is_left_out_of_all_has_no_error():
-    model, errors = problem()
-    use = np.arange(errors.num_folds) != 2
-    left = leave_out(model, errors, use)
-    assert np.isnan(left.square[2])
-    assert np.isfinite(np.delete(left.square, 2)).all()
-
-
-def test_few_trials_are_left_out_in_parts():
-    _, errors = problem(num=3)
-    assert not errors.is_by_trial
-    assert errors.num_folds >= 8
-    m = errors.measurements
-    for k in range(errors.num_folds):
-        at = errors.fold == k
-        assert len(np.unique(m.trial[at])) == 1
-        assert np.ptp(np.flatnonzero(at)) == at.sum() - 1  # neighbors in time
-
-
 @pytest.mark.parametrize("differs", [False, True])
 def test_an_error_that_trials_share_is_that_of_the_dense_integral(differs):
     model, errors = problem(differs=differs)
@@ -215,11 +196,6 @@ def test_an_error_that_trials_share_is_that_of_the_dense_integral(differs):
     off = means - p @ means
     exact = np.einsum("h,hij->ij", p, np.array(covs)) + (p[:, None] * off).T @ off
     assert cov == pytest.approx(exact, rel=1e-6)
-
-
-def test_trials_of_different_times_share_no_process():
-    model, errors = problem(ragged=True)
-    assert shared_process(model, errors, np.arange(NUM)[:, None] + 0.0) is None
 
 
 @pytest.mark.parametrize("far", [1.0, 1e6])

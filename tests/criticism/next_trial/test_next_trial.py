@@ -181,8 +181,13 @@ def missed():
     )
 
 
-def test_rivals_count_by_what_they_predict_and_not_by_evidence(missed):
-    tracing, chosen = missed.trace(), missed.next_action()
+@pytest.fixture(scope="module")
+def chosen(missed):
+    return missed.next_action()
+
+
+def test_rivals_count_by_what_they_predict_and_not_by_evidence(missed, chosen):
+    tracing = missed.trace()
     weights = tracing.misfit.weights
     assert chosen.separates == (*weights,)
     assert len(weights) > 2
@@ -194,15 +199,16 @@ def test_rivals_count_by_what_they_predict_and_not_by_evidence(missed):
     assert chosen.action is not None
 
 
-def test_trials_unlike_those_at_hand_tell_most(missed):
-    chosen = missed.next_action()
+def test_trials_unlike_those_at_hand_tell_most(chosen):
     assert float(chosen.action[0]) >= 3
     gain = chosen.information_gain
     assert gain[-2:].min() > gain[:-2].max()
     assert gain[-2:].max() > 0.2
 
 
-def test_an_action_that_some_draws_alone_chose_is_chosen_again(missed, monkeypatch):
+def test_an_action_that_some_draws_alone_chose_is_chosen_again(
+    missed, chosen, monkeypatch
+):
     """Its report is of other draws, and there it may tell nothing."""
     select, calls = next_action._Choosing.select, []
 
@@ -215,10 +221,9 @@ def test_an_action_that_some_draws_alone_chose_is_chosen_again(missed, monkeypat
         gain[design.index] = 0.0
         return replace(design, expected_information_gain=gain)
 
-    first = missed.next_action()
     monkeypatch.setattr(next_action._Choosing, "select", unlucky)
-    chosen = missed.next_action()
+    again = missed.next_action()
     assert calls[0] == len(LARGER.values)
     assert 0 < calls[1] < calls[0]
-    assert chosen.action is not None
-    assert chosen.action[0] != first.action[0]
+    assert again.action is not None
+    assert again.action[0] != chosen.action[0]

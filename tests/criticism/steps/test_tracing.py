@@ -19,9 +19,7 @@ from tests.criticism.steps import linear_world
 from tests.criticism.steps.linear_world import (
     ACTION,
     NOISE,
-    SHAPES,
     columns,
-    effect,
     judged,
     measured,
     posterior,
@@ -33,14 +31,6 @@ from tests.effects import added
 def tracing_of(x, **keywords):
     found = judged(rivals(x))
     return traced(found, None, **keywords)[0], found
-
-
-def test_families_share_what_none_leaves():
-    log_p = log_priors([effect(name) for name in SHAPES])
-    p = {name: np.exp(value) for name, value in log_p.items()}
-    assert p == pytest.approx(
-        {"none": 0.5, "curve": 1 / 8, "wave": 1 / 8, "kink": 1 / 4}
-    )
 
 
 @pytest.mark.parametrize(
@@ -147,15 +137,6 @@ def test_inclusion_and_the_credible_set_add_probabilities_up(kink):
 
 
 # Sets of several effects, against all sets of a linear world
-
-
-@pytest.mark.parametrize("size", [2, 3])
-def test_sets_of_several_effects_have_together_a_third_of_the_next_smaller(size):
-    prior = {"none": 0.6, "a": 0.1, "b": 0.2, "c": 0.05, "d": 0.05}
-    log_p = {name: float(np.log(p)) for name, p in prior.items()}
-    sets = combinations("abcd", size)
-    total = sum(np.exp(log_prior(names, log_p)) for names in sets)
-    assert total == pytest.approx(0.4 * 3.0 ** (1 - size))
 
 
 def test_a_name_may_contain_what_joins_names():
