@@ -68,6 +68,9 @@ for trial in range(2):
 # %% [markdown]
 # The same four calls as in sbi, `append_simulations`, `train`, `build_posterior` and
 # `sample`, and two more: `select` picks the action, `update` takes the outcome.
+# Code that knows posteriors of x alone (`set_default_x`, sbi's own checks and plots)
+# takes `inference.build_posterior().at(action)`.
+#
 # `belief` is a `torch.distributions.Distribution`; what was found about its quality
 # stands in
 

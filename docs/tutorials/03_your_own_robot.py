@@ -117,7 +117,7 @@ import sys
 
 
 def command(*words):
-    call = [sys.executable, "-c", "from sbi_active.cli import main; main()", *words]
+    call = [sys.executable, "-m", "sbi_active", *words]
     return subprocess.run(call, capture_output=True, text=True, check=True).stdout
 
 

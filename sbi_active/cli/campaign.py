@@ -153,8 +153,11 @@ def ask(campaign: Any, target: str) -> cli.Answer:
     data = record.trial_of(campaign, trial)
     data |= {"expected_information_gain": gain, "standard_error": error}
     tells = "" if math.isnan(gain) else f", expected to tell {gain:.2f} nats"
-    text = f"trial {trial.index}: {record.place_of(data)}{tells}"
-    return cli.Answer(data, f"{text}\nthen: sbi-active tell {campaign.directory}")
+    data["notes"] = [*getattr(trial.design, "notes", ())]
+    lines = [f"trial {trial.index}: {record.place_of(data)}{tells}"]
+    lines += [f"note: {note}" for note in data["notes"]]
+    lines += [f"then: sbi-active tell {campaign.directory}"]
+    return cli.Answer(data, "\n".join(lines))
 
 
 @on_campaign(*OUTCOME, AT, need="record")

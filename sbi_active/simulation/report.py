@@ -71,7 +71,7 @@ class SimulatorReport:
     def __str__(self) -> str:
         lines = []
         if self.x_shape is not None:
-            none = "none taken (one seeds 256 rows)"
+            none = "no argument for them; one is set for each 256 rows"
             counts = ", ".join(f"{n} {name}" for name, n in self.counts.items())
             lines += [
                 f"x: shape (n, {', '.join(map(str, self.x_shape))})",

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from benchmarks.robots.models import ARM, PENDULUM, SPRING_MASS, TIMES
-from sbi_active import BoxActions
+from sbi_active import BoxActions, Campaign, CampaignOptions
 from sbi_active.actions.signals import SignalActions
 from sbi_active.actions.waveforms import step
 from sbi_active.criticism import Trials
@@ -189,3 +189,17 @@ def test_what_does_not_fit_is_said(change, message):
 def test_a_parameter_that_changes_nothing_is_said_at_once():
     with pytest.warns(UserWarning, match="bob.com_y change nothing that is read"):
         pendulum(parameters={"hinge.damping": (0, 0.1), "bob.com_y": (-0.1, 0.1)})
+
+
+def test_the_belief_of_a_campaign_is_kept(tmp_path):
+    robot = pendulum()
+    few = CampaignOptions(network="on demand", num_simulations=300, num_samples=64)
+    parts = robot.simulator, robot.prior, robot.actions
+    truth = torch.tensor([[0.03, 1.0]])
+    with Campaign(*parts, directory=tmp_path / "c", seed=0, options=few) as campaign:
+        belief = campaign.run(lambda a: parts[0](truth, a[None])[0], num_rounds=1)
+    with Campaign.load(tmp_path / "c") as read:  # as status, watch and report do
+        assert not read.state.is_stale
+        assert torch.equal(read.belief.mean, belief.mean)
+    with Campaign.load(tmp_path / "c", simulator=pendulum().simulator) as loaded:
+        assert torch.equal(loaded.belief.log_prob(truth), belief.log_prob(truth))

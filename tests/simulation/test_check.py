@@ -100,7 +100,7 @@ def test_a_clean_simulator_is_ready(check, text):
     assert "at most 31,000 simulations, about " in printed
     assert "on 4 workers" in printed
     if text is CLEAN:
-        assert "x: shape (n, 1)\nseeds: none taken" in printed
+        assert "x: shape (n, 1)\nseeds: no argument" in printed
     else:
         assert "x: shape (n, 2)\nseeds: one a row" in printed
 

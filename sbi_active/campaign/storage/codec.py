@@ -61,8 +61,8 @@ def encode(value: Any, *, known: Mapping[str, Any]) -> bytes:
         value: Numbers, texts, arrays, tensors, containers, and objects of this library,
             sbi's utilities and networks, torch's distributions and modules.
         known: Objects that the reader has too, by name, such as the simulator and the
-            prior. It is stored by its name, and what hangs from it, where it is of a
-            class that is not stored, by its place.
+            prior. It is stored by its name, and what hangs from it, where it is the
+            function of a simulator or of a class that is not stored, by its place.
 
     Raises:
         NotStorableError: If there is anything else in it.
@@ -81,6 +81,8 @@ def encode(value: Any, *, known: Mapping[str, Any]) -> bytes:
         if id(value) in seen:
             return {TAG: "seen", "number": seen[id(value)][0]}
         seen[id(value)] = len(seen), value
+        if path[1:] == ("fn",):  # may hold compiled models, which nothing stores
+            return {TAG: "known", "path": path}
         if issubclass(kind, dict) and kind in NAMES:
             pairs = [[node(name), node(part)] for name, part in value.items()]
             return {TAG: NAMES[kind], "items": pairs}

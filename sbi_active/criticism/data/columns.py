@@ -96,7 +96,8 @@ def require_columns(
         f"columns {', '.join(names)}",
         f"{', '.join(there) or 'none of these'} in {source}",
         "name them, as in action_speed, x_distance[m] (action_none, of ones, where "
-        "nothing was set), or say which are what by columns= (--columns x=NAME)",
+        "nothing was set), input_voltage[V] where it varies in time, or say which are "
+        "what by columns= (--columns time=NAME --columns input=NAME --columns x=NAME)",
     )
 
 
