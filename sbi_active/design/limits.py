@@ -52,7 +52,7 @@ class DesignLimits:
                     f"({len(action)},), bool; got shape {tuple(answer.shape)}; "
                     "return one answer a row"
                 )
-            inside = answer.bool()
+            inside = inside & answer.bool()
         if len(self.exclude):
             offset = (action[:, None].float() - self.exclude).abs()
             inside = inside & ~(offset <= self._tolerance()).all(-1).any(1)
