@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 #: Columns with numbers, NaN where they are not known.
 NUMBERS = (
     *("expected_information", "expected_information_error", "information_gained"),
-    *("surprise", "log_score", "misfit", "outlyingness"),
+    *("surprise", "log_score", "misfit", "outlyingness", "cost"),
 )
 #: Columns that stand before those of action and outcome, and behind them.
 FIRST = ("trial", "status", "target")
