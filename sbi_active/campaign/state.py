@@ -65,8 +65,7 @@ class Trial:
         cost: Cost of the executed action, also of a trial that was missing or withdrawn
             since; None while it is pending, and without a cost or a budget.
         version: Number of the model that scored the trial.
-        seconds: Wall time by stage; this and what follows add up where the campaign is
-            computed again.
+        seconds: Wall time by stage; it and what follows add up if computed again.
         cpu_seconds: CPU time by stage.
         num_simulations: Simulations spent on this trial.
         num_missing: Number of those simulations lost to faults of the simulator.
@@ -268,8 +267,9 @@ class CampaignState:
             same = before.status == "pending" or Facts.of(before).tells == facts.tells
             known |= {} if same else UNSCORED
             self.trials[index] = replace(before, **known)
-            for later in range(index, num):  # a cost may depend on the trial before
-                self.change(later, cost=None)
+            for later in self.trials[index:]:  # which may cost by the trial before
+                if later.cost is not None:
+                    self.change(later.index, cost=None)
         self.is_stale |= index in self.processed
         return self.trials[index]
 

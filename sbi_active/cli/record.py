@@ -166,9 +166,10 @@ def summary_of(campaign: Any) -> dict[str, Any]:
         "codes": [warning.code for warning in said],
         "combinations": str(together) if together else None,
     }
+    state = campaign.state
     now = {"health": campaign.health, "not_in_belief": campaign.not_in_belief}
-    now |= {"spent": campaign.state.spent, "left": campaign.state.left}
-    return {"method": campaign.state.method, "belief": found, **now}
+    now |= {"spent": state.spent, "left": state.left}
+    return {"method": state.method, "belief": found, **now}
 
 
 def scored(trial: Any) -> dict[str, Any]:

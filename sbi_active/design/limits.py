@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import inspect
 import math
 from collections.abc import Callable
 from typing import Any
@@ -77,11 +76,6 @@ class DesignLimits:
 
     def _price_after(self, action: Tensor) -> Any:
         return self._price(action, self.previous)
-
-    @property
-    def permits(self) -> Callable[[Tensor], Tensor] | None:
-        """Mask of permitted actions, with what they may cost; None permits all."""
-        return None if self.constraint is None and self.left == math.inf else self
 
     def __call__(self, action: Tensor) -> Tensor:
         """Return a mask of permitted actions (n, action_dim), shape (n,), bool."""
@@ -191,12 +185,11 @@ class DesignLimits:
         return torch.cat(parts)
 
 
-def _takes_previous(price: Cost | None) -> bool:
+def _takes_previous(price: Any) -> bool:
     """Whether a cost has an argument ``previous``, or needs a second one."""
-    parameters = parameters_of(price) if callable(price) else []
-    needed = [p for p in parameters if p.default is inspect.Parameter.empty]
-    positional = [p for p in needed if p.kind < inspect.Parameter.VAR_POSITIONAL]
-    return len(positional) > 1 or any(p.name == "previous" for p in parameters)
+    own = [p for p in parameters_of(price) if p.kind < p.VAR_POSITIONAL]
+    needed = [p for p in own if p.default is p.empty]
+    return len(needed) > 1 or "previous" in [p.name for p in own]
 
 
 def _listed_cost(table: Tensor, actions: ActionSpace) -> Callable[[Tensor], Tensor]:

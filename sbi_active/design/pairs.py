@@ -38,41 +38,34 @@ def first_of_pair(
     """
     candidates, cost = design.candidates, limits.cost(design.candidates)
     gain = design.expected_information_gain.nan_to_num(0.0)
-    best, plan, joint = -math.inf, [design.index], 0.0
-    steps = [design]
-    for k in _largest(gain / cost, num):
+    alone, steps = gain / cost, [design]
+    plans: list[tuple[float, float, list[int]]] = []  # nats, cost, order
+    for k in _largest(alone, num):
         after = limits.after(candidates[k], limits.left - float(cost[k]))
         near = torch.nonzero(after(candidates))[:, 0]
-        pairs, told, paid = [[k]], gain[k : k + 1], cost[k : k + 1]
-        if len(near):
-            then = after.cost(candidates[near])
-            order = _largest(gain[near] / then, num)
-            steps.append(beyond(candidates[k], candidates[near[order]]))
-            told = told + steps[-1].expected_information_gain.nan_to_num(0.0)
-            pairs, paid = [[k, int(near[j])] for j in order], paid + then[order]
-        j = int((told / paid).argmax())
-        if float(told[j] / paid[j]) > best:
-            best, plan, joint = float(told[j] / paid[j]), pairs[j], float(told[j])
-
-    def dearness(order: list[int]) -> tuple[float, float]:
-        total = float(cost[order[0]])
-        if order[1:]:
-            total += float(
-                limits.after(candidates[order[0]]).cost(candidates[order[1:]])
-            )
-        return total, -float(gain[order[0]] / cost[order[0]])
-
-    # Either order tells the same; else what tells least may be done first, for ever.
-    plan = min(plan, plan[::-1], key=dearness)
-    places = "; then ".join(str(candidates[[k]].tolist()[0]) for k in plan)
-    note = f"planned {places}: {joint:.3g} nats for a cost of {dearness(plan)[0]:.4g}"
+        if not len(near):
+            plans.append((float(gain[k]), float(cost[k]), [k]))
+            continue
+        then = after.cost(candidates[near])
+        best = _largest(gain[near] / then, num)
+        steps.append(beyond(candidates[k], candidates[near[best]]))
+        told = gain[k] + steps[-1].expected_information_gain.nan_to_num(0.0)
+        orders = [[k, j] for j in near[best].tolist()]
+        paid = cost[k] + then[best]
+        plans += zip(told.tolist(), paid.tolist(), orders, strict=True)
+    told, paid, pair = max(plans, key=lambda plan: plan[0] / plan[1])
+    # Either order tells the same: what tells more by itself is not put off for ever.
+    alike = [p for p in plans if sorted(p[2]) == sorted(pair) and p[1] <= paid + 1e-9]
+    order = max((plan[2] for plan in alike), key=lambda order: float(alone[order[0]]))
+    places = [", ".join(f"{v:.4g}" for v in candidates[k].tolist()) for k in order]
+    note = f"planned [{'], then ['.join(places)}]: {told:.3g} nats for {paid:.4g}"
     error = design.difference_standard_error
-    if plan[0] != design.index:  # errors of differences were to another action
+    if order[0] != design.index:  # errors of differences were to another action
         error = torch.full_like(error, math.nan)
     return replace(
         design,
-        action=candidates[plan[0]],
-        index=plan[0],
+        action=candidates[order[0]],
+        index=order[0],
         difference_standard_error=error,
         num_simulations=sum(step.num_simulations for step in steps),
         num_missing=sum(step.num_missing for step in steps),

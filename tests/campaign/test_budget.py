@@ -195,4 +195,4 @@ def test_pairs_tell_more_than_single_trials_for_the_same_budget():
     assert [t.cost for t in c.history] == [5.0, 1.0, 9.0, 1.0]
     assert told[2] == pytest.approx(2 * torch.tensor(101.0).log().item())
     assert told[1] < told[2] - 1.5
-    assert "; then " in c.history[0].design.notes[-1]
+    assert "], then [" in c.history[0].design.notes[-1]

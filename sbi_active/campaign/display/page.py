@@ -198,6 +198,8 @@ def _trials(
     campaign: Any, *, most: int | None = None, left_out: Sequence[str] = ()
 ) -> Table:
     frame = campaign.to_dataframe().drop(columns=[*LEFT_OUT, *left_out]).reset_index()
+    if frame["cost"].isna().all():
+        frame = frame.drop(columns="cost")
     return Table.of(frame if most is None else frame[-most:])
 
 

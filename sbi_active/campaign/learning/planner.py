@@ -75,7 +75,7 @@ class Planner:
         listed = actions.listed()
         some = actions.sample((8,), seed=0) if listed is None else listed
         self._limits.cost(some)
-        self._limits.after(some[0]).cost(some[1:])
+        self._limits.after(some[0]).cost(some)
         self._designs = find_method(state.method).designs
         self._make_designer = partial(
             InformationGainDesigner,
@@ -121,14 +121,10 @@ class Planner:
         if state.left is None:
             return None
         waiting = [t.action for t in state.trials if t.status == "pending"]
-        if waiting:
-            affords = limits.cost(waiting[0][None]) <= limits.left
-        else:
-            values = limits.actions.listed()
-            affords = limits(
-                limits.actions.sample((1_024,), seed=0) if values is None else values
-            )
-        if bool(affords.any()):
+        values = torch.stack(waiting) if waiting else limits.actions.listed()
+        if values is None:
+            values = limits.actions.sample((1_024,), seed=0)
+        if bool(limits(values).any()):
             return None
         return (
             f"the budget is spent: the trials cost {state.spent:.4g} of "
@@ -195,7 +191,8 @@ class Planner:
                 to be learned about its parameters does not count.
         """
         limits = self.limits()
-        allowed = {"constraint": limits.permits}
+        free = limits.left == math.inf
+        allowed = {"constraint": limits.constraint if free else limits}
         if not self._designs:
             return self._select(index, learner, self._designer, **allowed), "random"
         if target == "auto" and self._checks(index):
@@ -286,7 +283,7 @@ def permitted(limits: DesignLimits) -> ActionSpace:
         ValueError: If nothing is permitted.
     """
     actions = limits.actions
-    if limits.permits is None:
+    if limits.constraint is None and limits.left == math.inf:
         return actions
     values, _ = limits.listed()
     if values is None:
