@@ -18,21 +18,13 @@ from sbi_active.campaign.isolation import guarded, isolated
 from sbi_active.campaign.learning.methods import find_method
 from sbi_active.campaign.learning.planner import Planner
 from sbi_active.campaign.learning.pooled import make_learner
-from sbi_active.campaign.learning.revision import (
-    recompute,
-    require_kind,
-    revise,
-)
+from sbi_active.campaign.learning.revision import recompute, require_kind, revise
 from sbi_active.campaign.options import CampaignOptions
 from sbi_active.campaign.state import CampaignState, Trial
-from sbi_active.campaign.storage.directory import (
-    Storage,
-    make_campaign,
-    num_rows,
-    stored,
-)
+from sbi_active.campaign.storage.directory import Storage, make_campaign, stored
 from sbi_active.campaign.storage.loading import load
 from sbi_active.campaign.trials import CampaignTrials
+from sbi_active.design.limits import Cost
 from sbi_active.design.target import Target
 from sbi_active.expected import suggests
 from sbi_active.simulation.workers.store import SimulationBudgetError, metering
@@ -48,10 +40,10 @@ class Campaign(CampaignTrials):
     A round: :meth:`ask` for an action, execute it, :meth:`tell` the outcome.
     ``tell`` only records; inference runs in the next ``ask`` or in :meth:`update`.
 
-    Each round trains a network, :attr:`posterior`; ``Trial.network_used_by`` lists its
-    users. With declared noise neither the action nor the refined belief depends on it:
-    notes and diagnostics compare it with them, and the refinement also searches where
-    it points. With the option ``network="on demand"`` it is trained only when needed.
+    Each round trains a network, :attr:`posterior`. With declared noise neither the
+    action nor the refined belief depends on it: notes and diagnostics compare it with
+    them, and the refinement also searches where it points. With the option
+    ``network="on demand"`` it is trained only when needed.
 
     Args:
         simulator: ``simulator(theta, action)``, shapes (n, theta_dim) and
@@ -64,6 +56,8 @@ class Campaign(CampaignTrials):
             actions are also chosen to test for these effects.
         cost: Cost of actions (n, action_dim), shape (n,), positive; or one number an
             action of a list. Actions are then chosen for their information by cost.
+            ``cost(action, previous)`` also takes the action executed before, shape
+            (action_dim,), None for the first. ``StopRules(budget=)`` limits the total.
         constraint: Function of actions (n, action_dim) that says which may be executed
             now, shape (n,), bool. The network learns about the others as well.
         seed: Seed of all draws; the same seed and outcomes give the same campaign.
@@ -107,7 +101,7 @@ class Campaign(CampaignTrials):
         *,
         method: str = "asbi",
         effects: Sequence[Effect] = (),
-        cost: Callable[[Tensor], Tensor] | Tensor | None = None,
+        cost: Cost | None = None,
         constraint: Callable[[Tensor], Tensor] | None = None,
         seed: int = 0,
         options: CampaignOptions | Mapping[str, Any] | None = None,
@@ -116,7 +110,7 @@ class Campaign(CampaignTrials):
     ) -> None:
         find_method(method)  # an unknown name is an error here
         actions, options = action_space(actions), CampaignOptions.of(options)
-        state = CampaignState(method, seed, options, num_earlier=num_rows(options.bank))
+        state = CampaignState(method, seed, options)
         with metering(state.meter):
             learner = make_learner(simulator, prior, actions, state)
         limits = {"cost": cost, "constraint": constraint}
@@ -141,6 +135,7 @@ class Campaign(CampaignTrials):
         self.state, self.actions = learner.state, learner.actions
         self._learner, self._planner, self._storage = learner, planner, storage
         self.state.show_progress = show_progress
+        self._charge()
         storage.bank = self.state.options.bank
 
     @classmethod
@@ -154,7 +149,7 @@ class Campaign(CampaignTrials):
         prior: Distribution | None = None,
         actions: Actions | None = None,
         effects: Sequence[Effect] = (),
-        cost: Callable[[Tensor], Tensor] | Tensor | None = None,
+        cost: Cost | None = None,
         constraint: Callable[[Tensor], Tensor] | None = None,
         options: CampaignOptions | Mapping[str, Any] | None = None,
         show_progress: bool = False,
@@ -245,6 +240,9 @@ class Campaign(CampaignTrials):
     def ask(self, *, target: Target = "auto") -> Trial:
         """Return the pending trial, or design the next one.
 
+        No action costs more than what is left of the budget. With a cost that depends
+        on the trial before, the next two are planned together (``look_ahead``).
+
         Args:
             target: Target of the design: "theta", names or a function of parameters
                 as in :meth:`.InformationGainDesigner.select`, or "model", whether the
@@ -257,8 +255,8 @@ class Campaign(CampaignTrials):
 
         Raises:
             ValueError: If the method draws its actions at random and the target is
-                another one, or "model" is asked for without effects or with fewer than
-                two trials.
+                another one, "model" is asked for without effects or with fewer than
+                two trials, or what is left of the budget affords no action.
         """
         if self.pending is not None:
             return self.pending
@@ -269,6 +267,8 @@ class Campaign(CampaignTrials):
                 f"{self.state.used_up}. Load the campaign with a larger "
                 "max_simulations to go on"
             )
+        if (reason := self._planner.spent_up) is not None:
+            raise ValueError(f"{reason}. Load the campaign with a larger budget")
         index = len(self.state.trials)
         self.state.trials.append(Trial(index, torch.empty(0)))
         try:

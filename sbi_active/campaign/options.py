@@ -39,15 +39,20 @@ class CampaignDetails:
         eliminate: Whether candidates far behind the leader get no further samples.
         num_scored: Simulations of each executed action, from the belief before the
             trial, that its outcome is compared with.
+        look_ahead: Trials that are planned together where the cost depends on the trial
+            before, 1 or 2. With 2 the next action is the first of the pair whose joint
+            information by total cost is largest.
     """
 
     posterior: str = "importance"
     eliminate: bool = True
     num_scored: int = 2_000
+    look_ahead: int = 2
 
     def __post_init__(self) -> None:
         advice = "use about 2000: no tail probability is below 1 / (num_scored + 1)"
         require_least(self, advice, num_scored=100)
+        require_one_of(self, look_ahead=(1, 2))
 
 
 @suggests
@@ -55,9 +60,9 @@ class CampaignDetails:
 class StopRules:
     """Rules by which :meth:`.Campaign.run` ends before its last round.
 
-    Any one ends it, but the first two only while the campaign's health is "ok": with a
-    simulator that lacks something, a belief becomes narrow at a wrong place, and both
-    would stop.
+    Any one ends it, but ``min_information_gain`` and ``max_sd`` only while the
+    campaign's health is "ok": with a simulator that lacks something, a belief becomes
+    narrow at a wrong place, and both would stop.
 
     Attributes:
         min_information_gain: Smallest expected information gain of the next trial,
@@ -70,20 +75,24 @@ class StopRules:
             network excludes the truth too often at some action. This ends a campaign
             whatever its health, at the cost of two inferences, or of 1,000 simulations,
             a trial.
+        budget: Total cost of all trials, in the unit of ``Campaign(cost=)``; without a
+            cost, their number. A campaign ends once what is left affords no action.
 
     Example:
         >>> StopRules(min_information_gain=0.1, max_sd=[0.05, 0.2])
-        StopRules(min_information_gain=0.1, max_sd=(0.05, 0.2), calibration_lost=False)
+        StopRules(min_information_gain=0.1, max_sd=(0.05, 0.2), calibration_lost=False,
+        budget=None)
     """
 
     min_information_gain: float | None = None
     max_sd: float | Sequence[float] | None = None
     calibration_lost: bool = False
+    budget: float | None = None
 
     def __post_init__(self) -> None:
         if isinstance(self.max_sd, Sequence):
             object.__setattr__(self, "max_sd", (*map(float, self.max_sd),))
-        limits = (self.min_information_gain, self.max_sd)
+        limits = (self.min_information_gain, self.max_sd, self.budget)
         require(
             all(np.all(np.array(limit) > 0) for limit in limits if limit is not None),
             "positive limits to stop at",
@@ -176,9 +185,8 @@ class CampaignOptions:
             gets half of what is left.
         workers: Workers that run all simulations, or the number of calls at a time.
         bank: Folder of simulations that campaigns on the same simulator share one after
-            another. The first round of a campaign begins with the rows of earlier ones,
-            weighted by :func:`.reuse`. None keeps them in the campaign's directory, if
-            it has one.
+            another: what is asked for again, by the same seed, parameters and action,
+            is read. None keeps them in the campaign's directory, if it has one.
         details: Further options that few campaigns change.
     """
 

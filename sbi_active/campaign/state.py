@@ -6,6 +6,7 @@ import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -20,6 +21,7 @@ from sbi_active.design.design import Design
 from sbi_active.display.notebook import card, facts
 from sbi_active.display.table import number
 from sbi_active.inference.emulation.pool import Batch
+from sbi_active.messages import warn
 from sbi_active.seeding import derive_seed, forked_generators
 from sbi_active.simulation.workers.store import Meter
 
@@ -43,8 +45,7 @@ class Trial:
         target: Target of the action: "theta" or names of parameters, "model", "check"
             for an action far from all others, "random"; None for an action that was not
             asked for.
-        information_gained: Realized information gain, KL(belief after || before) in
-            nats.
+        information_gained: Realized gain, KL(belief after || before), nats.
         surprise: Tail probability of x under the posterior predictive of the belief
             before the trial; uniform where the simulator is right.
         belief_error: Error in nats of the belief before the trial due to few
@@ -58,18 +59,13 @@ class Trial:
             action, in their range, by its farthest number; inf if none of them had
             such a number, None if it is as others from the belief before are. Above
             5 nothing in the prior explains the trial, and the belief leaves it out.
-        network_used_by: Users of this round's network: the "design", whose estimate
-            rests on it, or the design's "notes", which compare the estimate with it;
-            the "belief", where it is the network's word; where the belief is refined,
-            its "start", which adds simulations there and no weight, and its
-            "diagnostics", which compare the two; and :attr:`.Campaign.posterior`, as
-            "posterior".
         summary: The summary of the outcome that the belief rests on, where the action
             chooses among several.
         reason: Reason for which it was withdrawn.
+        cost: Cost of the executed action, also of a trial that was missing or withdrawn
+            since; None while it is pending, and without a cost or a budget.
         version: Number of the model that scored the trial.
-        seconds: Wall time by stage; this and what follows add up where the campaign is
-            computed again.
+        seconds: Wall time by stage; it and what follows add up if computed again.
         cpu_seconds: CPU time by stage.
         num_simulations: Simulations spent on this trial.
         num_missing: Number of those simulations lost to faults of the simulator.
@@ -87,9 +83,9 @@ class Trial:
     log_score: float | None = None
     misfit: float | None = None
     outlyingness: float | None = None
-    network_used_by: tuple[str, ...] = ()
     summary: str | None = None
     reason: str = ""
+    cost: float | None = None
     version: int | None = None
     seconds: dict[str, float] = field(default_factory=dict)
     cpu_seconds: dict[str, float] = field(default_factory=dict)
@@ -116,6 +112,7 @@ class Trial:
             ("beyond all simulations by", _with(self.outlyingness, "of their ranges")),
             ("simulations", self.num_simulations),
             ("lost of them", self.num_missing),
+            ("cost", _with(self.cost)),
             ("time", _with(sum(self.seconds.values()) or None, "s")),
             ("reason", self.reason),
         ]
@@ -133,6 +130,12 @@ class Trial:
             return float("nan"), float("nan")
         gain, error = design.expected_information_gain, design.standard_error
         return float(gain[design.index]), float(error[design.index])
+
+    @cached_property  # not a property: trials that were stored have it as a field
+    def network_used_by(self) -> tuple[str, ...]:
+        """Former users of this round's network, no longer written down."""
+        warn("SA701 Trial.network_used_by goes in the next version", stacklevel=2)
+        return ()
 
     @property
     def is_measured(self) -> bool:
@@ -209,11 +212,9 @@ class CampaignState:
         processed: Indices of trials that the belief contains, in order of use.
         versions: Lineage of the simulator, the current one last.
         is_stale: Whether a trial that the belief contains was corrected since.
-        num_earlier: Rows that were in ``options.bank`` before the campaign.
         draws: Draws of the belief after each trial, for pictures, by the trial's index,
             shape (n, theta_dim); of the parameters that the model had then.
-        batches: Simulations made for the current model where belief, designs and scores
-            share their simulations.
+        batches: Simulations for the current model where all that asks shares them.
         meter: Counter of the campaign's simulations.
         show_progress: Whether to draw a bar of what takes long.
     """
@@ -225,7 +226,6 @@ class CampaignState:
     processed: list[int] = field(default_factory=list)
     versions: list[ModelVersion] = field(default_factory=lambda: [ModelVersion()])
     is_stale: bool = False
-    num_earlier: int = 0
     draws: dict[int, Tensor] = field(default_factory=dict)
     batches: list[Batch] = field(default_factory=list)
     meter: Meter = field(default_factory=Meter)
@@ -267,6 +267,9 @@ class CampaignState:
             same = before.status == "pending" or Facts.of(before).tells == facts.tells
             known |= {} if same else UNSCORED
             self.trials[index] = replace(before, **known)
+            for later in self.trials[index:]:  # which may cost by the trial before
+                if later.cost is not None:
+                    self.change(later.index, cost=None)
         self.is_stale |= index in self.processed
         return self.trials[index]
 
@@ -296,10 +299,6 @@ class CampaignState:
         """
         examined = (*self.version.examined, digest)
         self.versions[-1] = replace(self.version, examined=examined)
-
-    def unscore(self, index: int) -> None:
-        """Forget what a trial was found to be."""
-        self.change(index, **UNSCORED)
 
     def change(self, index: int, **changes: Any) -> None:
         """Replace entries of a trial."""
@@ -342,6 +341,18 @@ class CampaignState:
         self.draws[index] = draws.reshape(num, -1).detach()
 
     @property
+    def spent(self) -> float | None:
+        """Total cost of the trials that were told; None if it is not known."""
+        costs = [t.cost for t in self.trials if t.status != "pending"]
+        return None if None in costs else sum(filter(None, costs))
+
+    @property
+    def left(self) -> float | None:
+        """What is left of the budget; None without one, or if it is not known."""
+        spent, budget = self.spent, self.options.stop.budget
+        return None if spent is None or budget is None else budget - spent
+
+    @property
     def used_up(self) -> str | None:
         """Why no round can begin, where the campaign's simulations are used up."""
         meter, fewest = self.meter, 24
@@ -357,8 +368,7 @@ class CampaignState:
         """Show progress while the block runs.
 
         Args:
-            index: Index of the trial that the work is for; of the next one where it is
-                for none.
+            index: Index of the trial that the work is for, or of the next one.
             name: Name of the work.
         """
         what = f"trial {index}: {name}" if index < len(self.trials) else name

@@ -60,11 +60,20 @@ class CampaignTrials(Telling[Trial]):
         done, pending = len(self.history), self.pending is not None
         return (
             f"Campaign({self.state.method}, {done} trials"
-            f"{', one pending' if pending else ''}{self._known_together()})"
+            f"{', one pending' if pending else ''}{self._paid()}"
+            f"{self._known_together()})"
         )
 
     def _repr_html_(self) -> str:
         return campaign_html(self)
+
+    def _paid(self) -> str:
+        """Return what is spent, where trials have a cost."""
+        spent, budget = self.state.spent, self.state.options.stop.budget
+        if not spent and budget is None:
+            return ""
+        shown = "an unknown cost" if spent is None else f"{spent:.4g}"
+        return f", {shown}{'' if budget is None else f' of {budget:.4g}'} spent"
 
     def _known_together(self) -> str:
         """Return the combinations that the belief knows of parameters not known alone.
@@ -193,11 +202,12 @@ class CampaignTrials(Telling[Trial]):
     def stop_reason(self) -> str | None:
         """Why ``options.stop`` says to stop, after the trials the belief contains.
 
-        None while the health is not "ok", but for a lost calibration: a confident wrong
-        belief would stop first.
+        None while the health is not "ok", but for a lost calibration and a budget that
+        is spent: a confident wrong belief would stop first.
         """
-        if self.state.used_up is not None:
-            return self.state.used_up
+        for reason in (self.state.used_up, self._planner.spent_up):
+            if reason is not None:
+                return reason
         if self.state.options.stop.calibration_lost:
             key = (*self.state.processed, self.state.version.number)
             known = self.__dict__.setdefault("_calibrations", {})
@@ -217,10 +227,11 @@ class CampaignTrials(Telling[Trial]):
 
         Columns: status and target; the entries of the action, with their units; the
         numbers of the outcome, or an array "x" where they are more than 16; those of
-        :class:`.Trial` by their names there; "expected_information" of the action and
-        "expected_information_error", its standard error, in nats; "health" when the
-        trial had been used, missing where it was not; "seconds" and "cpu_seconds" over
-        all stages. The index is the trial's. Units stand in ``attrs["units"]``.
+        :class:`.Trial` by their names there, such as "cost"; "expected_information" of
+        the action and "expected_information_error", its standard error, in nats;
+        "health" when the trial had been used, missing where it was not; "seconds" and
+        "cpu_seconds" over all stages. The index is the trial's. Units stand in
+        ``attrs["units"]``.
         """
         return to_dataframe(self)
 
@@ -275,7 +286,14 @@ class CampaignTrials(Telling[Trial]):
 
     def _record(self, event: str, facts: Facts) -> Trial:
         self._storage.write(event, facts)  # on the disk before it counts
-        return self.state.record(facts)
+        self.state.record(facts)
+        self._charge()
+        return self.state.trials[facts.index]
+
+    def _charge(self) -> None:
+        """Bring the costs up to date, unless the function is lacking that says them."""
+        if self._planner.has_cost or not self._storage.manifest.get("has_cost"):
+            self._planner.charge()
 
 
 def outcome_told(x: Any, x_shape: torch.Size) -> Tensor:

@@ -68,9 +68,12 @@ class Record(Telling[Any]):
         Raises:
             Unsure: If a trial that the belief has used is another one now.
         """
-        if {*self._known["summary"]["not_in_belief"]} & {*self._known["processed"]}:
+        summary, was_written = self._known["summary"], self._num > self._known["lines"]
+        if {*summary["not_in_belief"]} & {*self._known["processed"]}:
             raise Unsure
-        return self._known["summary"]
+        if was_written and (summary.get("spent") or summary.get("left")):
+            raise Unsure  # what a trial costs is a function's word
+        return summary
 
     @property
     def x_shape(self) -> Sequence[int]:
@@ -163,13 +166,15 @@ def summary_of(campaign: Any) -> dict[str, Any]:
         "codes": [warning.code for warning in said],
         "combinations": str(together) if together else None,
     }
+    state = campaign.state
     now = {"health": campaign.health, "not_in_belief": campaign.not_in_belief}
-    return {"method": campaign.state.method, "belief": found, **now}
+    now |= {"spent": state.spent, "left": state.left}
+    return {"method": state.method, "belief": found, **now}
 
 
 def scored(trial: Any) -> dict[str, Any]:
     """Return a trial with what a campaign has found it to be, if it has yet."""
-    scores = ("information_gained", "surprise")
+    scores = ("information_gained", "surprise", "cost")
     return {**vars(Facts.of(trial)), **{n: getattr(trial, n, None) for n in scores}}
 
 
@@ -192,6 +197,9 @@ def answer_of(campaign: Any) -> Answer:
     many = "s" * (len(trials) != 1)
     lines = [f"{data['method']}, {len(trials)} trial{many}, health {data['health']}"]
     lines += map(_line_of, trials)
+    if data.get("spent") or data.get("left"):
+        left = "" if data["left"] is None else f", {data['left']:.4g} left"
+        lines.append(f"{data['spent']:.4g} spent{left}")
     for name, entry in belief["parameters"].items():
         lines.append(f"{name:>12} = {entry['mean']:.4g} +- {entry['sd']:.2g}")
     notes = [belief["combinations"], *belief["warnings"]]

@@ -2,12 +2,20 @@
 
 from __future__ import annotations
 
+import copy
+import math
 from collections.abc import Callable
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from sbi_active.actions import ActionSpace, BoxActions
+from sbi_active.simulation.conditions import parameters_of
+
+#: Cost of actions (n, action_dim), shape (n,); a function of these and of the action
+#: executed before, or of these alone, or one number an action of a list.
+Cost = Callable[..., Tensor] | Tensor
 
 
 class DesignLimits:
@@ -19,9 +27,15 @@ class DesignLimits:
             shape (n,), bool; None permits all.
         exclude: Actions that are not to be repeated, shape (t, action_dim); in a box
             nor others within a hundredth of its width in every entry.
-        price: Cost of actions (n, action_dim), shape (n,), or one number for each
+        price: Cost of actions (n, action_dim), shape (n,), which may depend on the
+            action executed before, ``price(action, previous)``; or one number for each
             action of a list, shape (a,); None for none.
         least: Share of measurements that a choice needs.
+
+    Attributes:
+        is_sequential: Whether the cost depends on the action executed before.
+        previous: That action, shape (action_dim,); None before any.
+        left: Largest cost of an action.
 
     Raises:
         ValueError: If excluded actions or a list of costs have another shape.
@@ -32,14 +46,36 @@ class DesignLimits:
         actions: ActionSpace,
         constraint: Callable[[Tensor], Tensor] | None = None,
         exclude: Tensor | None = None,
-        price: Callable[[Tensor], Tensor] | Tensor | None = None,
+        price: Cost | None = None,
         least: float = 0.0,
     ) -> None:
         self.actions, self.constraint, self.least = actions, constraint, least
         self.exclude = rows_of(actions, exclude, "exclude")
         if price is not None and not callable(price):
             price = _listed_cost(torch.as_tensor(price), actions)
-        self.price = price
+        self._price: Any = price
+        self.is_sequential = _takes_previous(price)
+        self.previous: Tensor | None = None
+        self.left = math.inf
+
+    def after(self, previous: Tensor | None, left: float = math.inf) -> DesignLimits:
+        """Return the limits of a trial after another, with what is left to spend.
+
+        Args:
+            previous: Action executed before, shape (action_dim,); None for none.
+            left: Largest cost of an action.
+        """
+        own = copy.copy(self)
+        own.previous, own.left = previous, left
+        return own
+
+    @property
+    def price(self) -> Callable[[Tensor], Tensor] | None:
+        """Cost of actions (n, action_dim) after the one before; None for none."""
+        return self._price_after if self.is_sequential else self._price
+
+    def _price_after(self, action: Tensor) -> Any:
+        return self._price(action, self.previous)
 
     def __call__(self, action: Tensor) -> Tensor:
         """Return a mask of permitted actions (n, action_dim), shape (n,), bool."""
@@ -52,7 +88,9 @@ class DesignLimits:
                     f"({len(action)},), bool; got shape {tuple(answer.shape)}; "
                     "return one answer a row"
                 )
-            inside = answer.bool()
+            inside = inside & answer.bool()
+        if self.left < math.inf:
+            inside = inside & (self.cost(action) <= self.left)
         if len(self.exclude):
             offset = (action[:, None].float() - self.exclude).abs()
             inside = inside & ~(offset <= self._tolerance()).all(-1).any(1)
@@ -145,6 +183,13 @@ class DesignLimits:
             for part in self.actions.parts()
         ]
         return torch.cat(parts)
+
+
+def _takes_previous(price: Any) -> bool:
+    """Whether a cost has an argument ``previous``, or needs a second one."""
+    own = [p for p in parameters_of(price) if p.kind < p.VAR_POSITIONAL]
+    needed = [p for p in own if p.default is p.empty]
+    return len(needed) > 1 or "previous" in [p.name for p in own]
 
 
 def _listed_cost(table: Tensor, actions: ActionSpace) -> Callable[[Tensor], Tensor]:

@@ -9,6 +9,7 @@ from sbi_active import BoxActions, DiscreteActions, MixedActions
 from sbi_active.actions import SignalActions
 from sbi_active.actions.waveforms import chirp, multisine, recorded, step, together
 from sbi_active.criticism import Trials
+from sbi_active.design.limits import DesignLimits
 from sbi_active.simulation import SimulatorModel
 
 BOX = BoxActions([0.0, -1.0], [2.0, 1.0], names=["speed", "angle"], units=["m/s", ""])
@@ -133,7 +134,10 @@ def test_a_signal_may_last_so_long():
 def test_a_part_of_a_product_keeps_its_limits():
     space = MixedActions(chirps(rate=100.0), BoxActions(0.0, 1.0, names=["load"]))
     slow, fast = [3.0, 2.0, 0.5], [3.0, 9.0, 0.5]
-    assert space.permits(torch.tensor([slow, fast])).tolist() == [True, False]
+    both = torch.tensor([slow, fast])
+    assert space.permits(both).tolist() == [True, False]
+    limits = DesignLimits(space, lambda action: action[:, 0] < 4)
+    assert limits(both).tolist() == [True, False]
 
 
 def test_recorded_signals_are_listed():

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 #: Columns with numbers, NaN where they are not known.
 NUMBERS = (
     *("expected_information", "expected_information_error", "information_gained"),
-    *("surprise", "log_score", "misfit", "outlyingness"),
+    *("surprise", "log_score", "misfit", "outlyingness", "cost"),
 )
 #: Columns that stand before those of action and outcome, and behind them.
 FIRST = ("trial", "status", "target")
@@ -198,6 +198,8 @@ def _trials(
     campaign: Any, *, most: int | None = None, left_out: Sequence[str] = ()
 ) -> Table:
     frame = campaign.to_dataframe().drop(columns=[*LEFT_OUT, *left_out]).reset_index()
+    if frame["cost"].isna().all():
+        frame = frame.drop(columns="cost")
     return Table.of(frame if most is None else frame[-most:])
 
 

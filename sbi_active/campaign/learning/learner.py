@@ -28,7 +28,7 @@ from sbi_active.campaign.learning.indexed import (
 from sbi_active.campaign.learning.methods import find_method
 from sbi_active.campaign.learning.rounds import Round
 from sbi_active.campaign.score import score_outcome
-from sbi_active.campaign.state import CampaignState, Trial
+from sbi_active.campaign.state import UNSCORED, CampaignState, Trial
 from sbi_active.identifiability.known import note_combinations
 from sbi_active.inference.beliefs.belief import information_gained, named
 from sbi_active.inference.beliefs.diagnostics import Diagnostics
@@ -159,7 +159,7 @@ class Learner:
                 trial = self._scored(trial)
             self._learn(trial)
         except SimulationBudgetError as error:
-            state.unscore(trial.index)
+            state.change(trial.index, **UNSCORED)
             warn(
                 f"SA602 trial {trial.index} is recorded and not in the belief: {error}"
             )
@@ -259,8 +259,6 @@ class Learner:
         refine = self.state.options.refine
         if not self.has_index and (self.trains_each_round or not refine):
             self.round.trained(index)
-            users = self.inference.network_serves if refine else ("belief",)
-            self.round.note(index, *users)
 
     def _updated(self, trial: Trial) -> tuple[Any, int, int]:
         """Return the belief with one more trial, its simulations and those missing."""

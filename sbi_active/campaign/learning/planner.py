@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
+from dataclasses import replace
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -17,7 +20,8 @@ from sbi_active.campaign.state import CampaignState, Trial
 from sbi_active.design.design import Design, action_labels, equal_errors
 from sbi_active.design.designer import InformationGainDesigner
 from sbi_active.design.estimators.automatic import ESTIMATORS
-from sbi_active.design.limits import DesignLimits
+from sbi_active.design.limits import Cost, DesignLimits
+from sbi_active.design.pairs import first_of_pair
 from sbi_active.design.random_designer import RandomDesigner
 from sbi_active.design.target import Target, name_of
 from sbi_active.seeding import derive_seed
@@ -37,8 +41,7 @@ class Planner:
         effects: Effects that its simulator may lack.
         constraint: Function of actions (n, action_dim) that says which are permitted,
             shape (n,), bool; None permits all.
-        cost: Cost of actions (n, action_dim), shape (n,), or one number an action of a
-            list; None for none.
+        cost: Cost of actions, see :class:`.Campaign`; None for none.
 
     Attributes:
         effects: Effects that the simulator may lack.
@@ -54,7 +57,7 @@ class Planner:
         effects: Sequence[Effect],
         *,
         constraint: Callable[[Tensor], Tensor] | None = None,
-        cost: Callable[[Tensor], Tensor] | Tensor | None = None,
+        cost: Cost | None = None,
     ) -> None:
         from sbi_active.criticism.effects.declarations import (
             require_distinct,
@@ -70,17 +73,64 @@ class Planner:
         # A wrong shape is an error here, and not in a later round.
         permitted(self._limits)
         listed = actions.listed()
-        self._limits.cost(actions.sample((8,), seed=0) if listed is None else listed)
+        some = actions.sample((8,), seed=0) if listed is None else listed
+        self._limits.cost(some)
+        self._limits.after(some[0]).cost(some)
         self._designs = find_method(state.method).designs
-        self._designer: Any = RandomDesigner(actions)
-        if self._designs:
-            self._designer = InformationGainDesigner(
-                actions,
-                num_samples=options.num_samples,
-                estimator=options.estimator,
-                eliminate=options.details.eliminate,
-                workers=options.workers,
-            )
+        self._make_designer = partial(
+            InformationGainDesigner,
+            num_samples=options.num_samples,
+            estimator=options.estimator,
+            eliminate=options.details.eliminate,
+            workers=options.workers,
+        )
+        kind = self._make_designer if self._designs else RandomDesigner
+        self._designer: Any = kind(actions)
+
+    @property
+    def has_cost(self) -> bool:
+        """Whether actions have a cost."""
+        return self._limits.price is not None
+
+    def charge(self) -> None:
+        """Set the cost of each trial that was told, at the executed action."""
+        state, previous = self._state, None
+        if not self.has_cost and state.options.stop.budget is None:
+            return
+        for trial in state.trials:
+            if trial.status != "pending":
+                cost = self._limits.after(previous).cost(trial.action[None])
+                state.change(trial.index, cost=float(cost))
+                previous = trial.action
+
+    def limits(self, *, slack: float = 1e-6) -> DesignLimits:
+        """Return the limits of the next trial, by the last one and what is left.
+
+        Args:
+            slack: Share of the budget that costs in float32 may be off by in all.
+        """
+        told = [t.action for t in self._state.trials if t.status != "pending"]
+        left, budget = self._state.left, self._state.options.stop.budget
+        most = math.inf if left is None or budget is None else left + slack * budget
+        return self._limits.after(told[-1] if told else None, most)
+
+    @property
+    def spent_up(self) -> str | None:
+        """Why no trial can follow, where what is left of a budget affords none."""
+        state, limits = self._state, self.limits()
+        if state.left is None:
+            return None
+        waiting = [t.action for t in state.trials if t.status == "pending"]
+        values = torch.stack(waiting) if waiting else limits.actions.listed()
+        if values is None:
+            values = limits.actions.sample((1_024,), seed=0)
+        if bool(limits(values).any()):
+            return None
+        return (
+            f"the budget is spent: the trials cost {state.spent:.4g} of "
+            f"{state.options.stop.budget:.4g}, and what is left affords no permitted "
+            "action"
+        )
 
     def require(self, target: Target) -> None:
         """Raise a ValueError if a trial cannot be designed for a target."""
@@ -140,7 +190,9 @@ class Planner:
             alarmed: Whether the simulator no longer explains the trials; then what is
                 to be learned about its parameters does not count.
         """
-        limits, allowed = self._limits, {"constraint": self._limits.constraint}
+        limits = self.limits()
+        free = limits.left == math.inf
+        allowed = {"constraint": limits.constraint if free else limits}
         if not self._designs:
             return self._select(index, learner, self._designer, **allowed), "random"
         if target == "auto" and self._checks(index):
@@ -170,9 +222,8 @@ class Planner:
             about: Any = {"target": own, "cost": limits.price}
             chosen = index, learner, self._designer, model
             design = self._select(*chosen, **about, **allowed)
-            if model.was_asked:
-                user = "design" if _rests_on_model(design) else "notes"
-                learner.round.note(index, user)
+            if limits.is_sequential and self._state.options.details.look_ahead > 1:
+                design = self._with_next(design, limits, index, learner, model, own)
         if about_model is not None:  # nats a unit of cost
             gains = [float(d.utility[d.index]) for d in (about_model, design)]
             if gains[0] > gains[1]:
@@ -198,6 +249,28 @@ class Planner:
                 **options,
             )
 
+    def _with_next(
+        self,
+        design: Design,
+        limits: DesignLimits,
+        index: int,
+        learner: Learner,
+        model: Any,
+        target: Target,
+    ) -> Design:
+        """Return the design of a trial that is planned together with the one after."""
+        needs = {kind.__name__: kind.needs_model for kind in ESTIMATORS.values()}
+        if needs.get(design.estimator) and not hasattr(model, "log_likelihood"):
+            note = f"planned alone: {design.estimator} has no joint information"
+            return replace(design, notes=(*design.notes, note))
+
+        def beyond(first: Tensor, places: Tensor) -> Design:
+            designer = self._make_designer(DiscreteActions(places))
+            known = {"target": target, "pending": first}
+            return self._select(index, learner, designer, model, **known)
+
+        return first_of_pair(design, limits, beyond)
+
     def _checks(self, index: int) -> bool:
         every = self._state.options.check_every
         return every is not None and (index + 1) % every == 0
@@ -210,7 +283,7 @@ def permitted(limits: DesignLimits) -> ActionSpace:
         ValueError: If nothing is permitted.
     """
     actions = limits.actions
-    if limits.constraint is None:
+    if limits.constraint is None and limits.left == math.inf:
         return actions
     values, _ = limits.listed()
     if values is None:
@@ -293,9 +366,3 @@ def _model_design(criticism: Criticism, limits: DesignLimits) -> Design | None:
         notes=(f"about which is right: {', '.join(found.separates)}",),
         cost=cost,
     )
-
-
-def _rests_on_model(design: Design) -> bool:
-    """Return whether an estimator uses something learned; unknown ones do."""
-    needs = {kind.__name__: kind.needs_model for kind in ESTIMATORS.values()}
-    return needs.get(design.estimator, True)

@@ -13,7 +13,7 @@ from torch.distributions import Distribution
 from sbi_active.actions import ActionSpace
 from sbi_active.campaign.learning.learner import Learner
 from sbi_active.campaign.learning.pooled import make_learner
-from sbi_active.campaign.state import CampaignState, ModelVersion, Trial
+from sbi_active.campaign.state import UNSCORED, CampaignState, ModelVersion, Trial
 from sbi_active.expected import require
 from sbi_active.seeding import derive_seed
 from sbi_active.simulation import SimulatorModel
@@ -193,7 +193,7 @@ def recompute(state: CampaignState, learner: Learner) -> None:
     state.draws.clear()
     for trial in state.trials:
         if trial.status != "pending":
-            state.unscore(trial.index)
+            state.change(trial.index, **UNSCORED)
     learner.restart()
     if version.trials:
         before = [t for i in version.trials if (t := state.trials[i]).is_measured]

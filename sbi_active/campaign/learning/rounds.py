@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import logging
-import warnings
 from collections.abc import Callable
-from dataclasses import replace
 from typing import Any
 
 import torch
@@ -17,16 +14,14 @@ from sbi_active.inference.models.posterior import ActionPosterior
 from sbi_active.seeding import derive_seed, forked_generators
 from sbi_active.simulation.bank.bank import Bank
 from sbi_active.simulation.outcomes import Simulations
-from sbi_active.simulation.reweighting import FEW, reuse
 from sbi_active.simulation.workers.engine import simulate
 from sbi_active.simulation.workers.store import find_store
 
-LOGGER = logging.getLogger("sbi_active")
 DENSITIES = ("log_posterior", "log_likelihood", "log_ratio")
 
 
 class Round:
-    """A round of a campaign: its simulations, its network and who uses it.
+    """A round of a campaign: its simulations and its network.
 
     Args:
         learner: Learner whose belief the round begins at.
@@ -35,15 +30,6 @@ class Round:
     def __init__(self, learner: Any) -> None:
         self._learner = learner
         self._is_trained = False
-        self._users: tuple[str, ...] = ()
-
-    def note(self, index: int, *users: str) -> None:
-        """Write down who uses this round's network, see :class:`.Trial`."""
-        state = self._learner.state
-        self._users = (*self._users, *users)
-        if index < len(state.trials):
-            all_users = (*state.trials[index].network_used_by, *self._users)
-            state.change(index, network_used_by=(*dict.fromkeys(all_users),))
 
     def model(self, index: int) -> RoundModel:
         """Return the model that a design asks, trained now or on demand.
@@ -78,7 +64,6 @@ class Round:
         expected = "the method 'asbi' or 'nsbi', whose network is a posterior"
         is_posterior = isinstance(model, ActionPosterior)
         require(is_posterior, expected, self._learner.state.method, "use the belief")
-        self.note(index, "posterior")
         return model
 
     def trained(self, index: int) -> Any:
@@ -104,9 +89,7 @@ class Round:
     def _rows(self, index: int) -> tuple[Simulations, int, int]:
         """Simulate the round: parameters from the belief, actions from the space.
 
-        A first round begins with what earlier campaigns left in a bank, and stores the
-        others with their density under the prior, by which the next campaign weights
-        them.
+        The rows of a first round are stored with their density under the prior.
 
         Returns:
             Rows without the missing, how many were simulated, and how many of these
@@ -120,61 +103,16 @@ class Round:
         action = learner.actions.sample((num,), seed=derive_seed(seed, "action", key))
         theta, action = learner.inference.arrange(drawn, action)
         simulator, own = learner.at(index), derive_seed(seed, "x", key)
-        store = earlier = None
+        store = None
         if key == 0 and theta is drawn and not learner.has_index:
             store = find_store(simulator)
-            earlier = self._earlier(store, len(theta), own)
-            if isinstance(store, Bank):
+            if isinstance(store, Bank):  # so that :func:`.reuse` can weight the rows
                 store = store.drawn_from(learner.belief, label="prior")
-        first = 0 if earlier is None else len(earlier)
-        if earlier is not None and first == len(theta):
-            return earlier, 0, 0
+        workers = state.options.workers
         rows = simulate(
-            simulator,
-            theta[first:],
-            action[first:],
-            seed=own,
-            workers=state.options.workers,
-            store=store,
+            simulator, theta, action, seed=own, workers=workers, store=store
         )
-        known = rows.without_missing()
-        if earlier is not None:
-            pairs = [(earlier.theta, known.theta), (earlier.action, known.action)]
-            x = torch.cat([earlier.x, known.x])
-            known = Simulations(*map(torch.cat, pairs), x=x)
-        return known, len(rows), rows.counts["missing"]
-
-    def _earlier(self, bank: Any, num_rows: int, seed: int) -> Simulations | None:
-        """Return as many rows of earlier campaigns as they are worth; None if few.
-
-        Rows that this campaign stored itself must not count when it begins again, nor
-        do those of other actions.
-        """
-        learner, state = self._learner, self._learner.state
-        if not (isinstance(bank, Bank) and state.num_earlier):
-            return None
-        try:
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore")  # their number is said below
-                found = reuse(bank, learner.belief)
-        except ValueError:  # none whose proposal is known
-            return None
-        permitted = learner.actions.contains(bank.read(found.rows).action)
-        weights = found.weights * (permitted & (found.rows < state.num_earlier))
-        if not weights.sum() > 0:
-            return None
-        found = replace(found, weights=weights / weights.sum())
-        worth = found.effective_sample_size
-        used = min(num_rows, int(worth))
-        LOGGER.info(
-            "first round: %d of %d rows are read from %s, whose %d earlier rows are "
-            "worth %.0f draws from the prior",
-            *(used if used >= FEW else 0, num_rows, bank.path),
-            *(int((weights > 0).sum()), worth),
-        )
-        if used < FEW:
-            return None
-        return found.resample(used, seed=derive_seed(seed, "reused"))
+        return rows.without_missing(), len(rows), rows.counts["missing"]
 
 
 class RoundModel:
@@ -185,14 +123,10 @@ class RoundModel:
     Args:
         trained: Function that returns the model, trained in this call if needed; None
             if none can be, as of discrete parameters.
-
-    Attributes:
-        was_asked: Whether something did.
     """
 
     def __init__(self, trained: Callable[[], Any] | None) -> None:
         self._trained, self._model = trained, None
-        self.was_asked = False
 
     @property
     def is_trained(self) -> bool:
@@ -208,9 +142,6 @@ class RoundModel:
     def __getattr__(self, name: str) -> Any:
         if self._trained is None:
             raise AttributeError(name)
-        is_density = name in DENSITIES
-        if is_density:
+        if name in DENSITIES:
             self.train()
-        found = getattr(self._model, name)
-        self.was_asked |= is_density
-        return found
+        return getattr(self._model, name)

@@ -205,9 +205,7 @@ def make_campaign(
     """
     packages = {name: version(name) for name in PACKAGES}
     packages["python"] = platform.python_version()
-    manifest = {
-        name: getattr(state, name) for name in ("method", "seed", "num_earlier")
-    }
+    manifest = {"method": state.method, "seed": state.seed}
     manifest |= {"created": telling.now(), "packages": packages}
     manifest["simulator"] = fingerprint(simulator)
     for name in ("parameter_names", "channel_names"):
@@ -294,15 +292,3 @@ def form_of(simulator: Any, own: Any) -> str:
         return "noise-free"
     index = getattr(simulator, "next_index", None)
     return "" if index is None else f"drawn-trial-{index}"
-
-
-def num_rows(folder: str | None) -> int:
-    """Return how many rows of the simulator itself a bank of campaigns has.
-
-    Args:
-        folder: Folder of the bank; None for none.
-    """
-    if folder is None or not Path(folder, NAME).exists():
-        return 0
-    store = Store(Path(folder))
-    return len(Bank(store, name=OWN)) if f"bank {OWN}" in store.catalog else 0

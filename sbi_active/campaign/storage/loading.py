@@ -50,7 +50,7 @@ def load(
     with store.reading():
         lost = manifest.get("own", ())  # there draws stand for them, as they did once
         kept = {w: None if w in lost else _decoded(store.get(w)) for w in given}
-        facts = {name: manifest[name] for name in ("method", "seed", "num_earlier")}
+        facts = {name: manifest[name] for name in ("method", "seed")}
         shape = torch.Size(manifest["x_shape"])
     for what, thing in kept.items():
         found[what] = thing if given[what] is None else given[what]

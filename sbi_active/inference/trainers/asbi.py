@@ -96,7 +96,6 @@ class ASBI(MixtureRounds, NPE_C):
     """
 
     _fused = True
-    network_serves = ("start", "diagnostics")
 
     @extends(NPE_C.__init__)
     def __init__(self, *args: Any, **kwargs: Any) -> None:

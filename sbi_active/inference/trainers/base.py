@@ -80,14 +80,11 @@ class ActiveInference(ABC):
             ``model.belief`` draws.
         starts_at_network: Whether a refinement begins at this round's network, where
             there is one.
-        network_serves: Use of that network: the "start" of a refinement, or also its
-            "diagnostics", which compare it with the refined belief.
     """
 
     trials: list[Observation]
     amortized: ClassVar[bool] = True
     starts_at_network: bool = True
-    network_serves: ClassVar[tuple[str, ...]] = ()
 
     append_simulations: Callable[..., Any]
     train: Callable[..., Any]

@@ -64,7 +64,6 @@ class ProductRounds(ActionRounds):
         to where a network was trained).
     """
 
-    network_serves = ("start",)
     _factor: ClassVar[type[ActionFactor]]
 
     def __init__(self, *args: Any, posterior: str, **kwargs: Any) -> None:
