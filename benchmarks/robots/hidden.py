@@ -210,7 +210,7 @@ def run_case(name: str, kind: str, seed: int) -> dict[str, object]:
     begin = time.process_time()
     loop = Criticism(model, robot.prior, measured(x), effects=effects, seed=seed)
     tracing = loop.trace()
-    groups = [*tracing.equivalent, *tracing.near]
+    groups = [*tracing.equivalent, *tracing.near, *tracing.aliases]
     stated = {n for g in groups if g & {*tracing.chosen} for n in g}
     wanted = row["effect"]
     right = tracing.verdict == wanted or wanted in stated

@@ -226,7 +226,8 @@ class Criticism:
         # Each model's held-out errors would take as much as the verdict.
         held_out = None if large else self._parts[1].held_out
         with stage("verdict, sets of effects fitted", show_progress=self.show_progress):
-            tracing, models = traced(found, held_out, near=not large)
+            actions = None if large else self.actions  # the next action looks for more
+            tracing, models = traced(found, held_out, actions=actions, near=not large)
         if tracing.misfit is None:
             tracing = widened(tracing, models)
         return replace(tracing, set_aside=self.set_aside), models

@@ -228,6 +228,9 @@ class Tracing:
         equivalent: Groups of names that no permitted action separates ("none" for an
             effect that shows nowhere).
         near: Groups for the trials at hand alone; another action may separate them.
+        aliases: After an alarm, pairs of an effect of the verdict and one that explains
+            the data about as well (log evidence within log 20 of the best) with
+            predictions closer than the noise; repeated trials may separate them.
         estimates: Estimates, one an effect, most probable first.
         evidences: Evidence of every model tried, by name. Priors of effects have
             unknown scale.
@@ -284,6 +287,7 @@ class Tracing:
     log_process: float = -float("inf")
     bounds: Bounds = Bounds()
     set_aside: tuple[OutlyingTrial, ...] = ()
+    aliases: tuple[frozenset[str], ...] = ()
 
     @property
     def key(self) -> ModelKey:

@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
+from itertools import combinations
 from typing import Any
 
 import numpy as np
 
+from sbi_active.actions import ActionSpace
 from sbi_active.arrays import Array
 from sbi_active.criticism.data.trials import Trials
 from sbi_active.criticism.evidence.rival_set import RivalSet
+from sbi_active.criticism.linear.search import Search
 from sbi_active.criticism.misfit.contrary import is_left_to_chance, withdrawn
 from sbi_active.criticism.misfit.draws import posterior
 from sbi_active.criticism.misfit.guesses import guess_residual
@@ -22,8 +26,13 @@ from sbi_active.criticism.results import (
     ModelKey,
     Tracing,
 )
+from sbi_active.criticism.rivals.trial_simulator import TrialSimulator
 from sbi_active.criticism.steps.detection import THRESHOLD
-from sbi_active.criticism.steps.equivalence import equivalent_effects
+from sbi_active.criticism.steps.equivalence import (
+    equivalent_effects,
+    every_action,
+    noise_unit,
+)
 from sbi_active.criticism.steps.predictive import predict
 from sbi_active.criticism.steps.tracing import credible_set
 from sbi_active.criticism.under_misfit import Misfit as Found
@@ -35,32 +44,42 @@ SHOWN = 0.01
 
 
 def traced(
-    found: Verdict, held_out: Trials | None, *, near: bool = True
+    found: Verdict,
+    held_out: Trials | None,
+    *,
+    actions: ActionSpace | None = None,
+    near: bool = True,
 ) -> tuple[Tracing, RivalSet]:
     """Return the verdict, and the models behind it with posterior draws.
 
     Args:
         found: The models and what helps.
         held_out: Trials on which the recorded models are scored; None for none.
+        actions: The permitted ones, over which effects like those of the verdict are
+            looked for; None looks at the trials at hand.
         near: Whether to look for groups that these trials do not separate as well.
     """
     rivals, is_missed = found.rivals, found.is_missed
     keys, probabilities = _tabled(found) if is_missed else _likely(found)
     models = _with_posteriors(found, keys)
     evidences = {str(key): fit.evidence for key, fit in models.fits.items()}
+    groups = equivalent_effects(rivals, None) if near and not is_missed else ()
     trials = rivals.trials
     tracing = Tracing(
         probabilities=probabilities,
         inclusion=found.inclusion,
         credible_set=credible_set(probabilities),
         equivalent=(*found.equivalent,),
-        near=equivalent_effects(rivals, None) if near and not is_missed else (),
+        near=groups,
         estimates=_estimates(found, evidences),
         evidences=evidences,
         robust=found.is_robust(),
         trial_names=dict(zip(trials.index.tolist(), trials.names, strict=True)),
         **(_missing(found, models, held_out) if is_missed else _explaining(found)),
     )
+    if found.detection.alarm:
+        aliases = like_the_verdict(found, tracing, None if is_missed else actions)
+        tracing = replace(tracing, aliases=aliases)
     is_withdrawn = not is_missed and is_left_to_chance(tracing)
     return withdrawn(tracing) if is_withdrawn else tracing, models
 
@@ -244,3 +263,74 @@ def _estimates(found: Verdict, evidences: dict[str, Evidence]) -> tuple[Estimate
         )
         estimates.append(estimate)
     return (*sorted(estimates, key=lambda e: -e.probability),)
+
+
+def like_the_verdict(
+    found: Verdict, tracing: Tracing, actions: ActionSpace | None
+) -> tuple[frozenset[str], ...]:
+    r"""Return pairs of an effect of the verdict and one that is nearly the same here.
+
+    Both alone have an evidence within log 20 of the best effect's, so that neither is
+    worth an alarm against the other, and fitted to the trials their predictions differ
+    by less than the noise in the root mean square:
+
+    .. math::
+        \tfrac1N \sum_i (m_{a,i} - m_{b,i})^2 / s_i^2 < 1 .
+
+    They are not equivalent: repeated trials, or stronger data, tell them apart.
+
+    Args:
+        found: The verdict, whose search has fitted each effect alone.
+        tracing: What it says, with the groups that are stated already.
+        actions: The permitted ones; None compares on the trials at hand.
+    """
+    search, log_z = found.search, {}
+    for name in search.names:
+        key = ModelKey((name,))
+        is_beside = tracing.misfit is not None
+        log_z[name] = (
+            search.found[key].beside.log_evidence
+            if is_beside
+            else found.states.log_evidence(key)
+        )
+    best = max(log_z.values(), default=-np.inf)
+    likely = [name for name, value in log_z.items() if value > best - THRESHOLD]
+    pairs = [
+        frozenset({a, b})
+        for a, b in combinations(likely, 2)
+        if {a, b} & {*tracing.chosen}
+        and not any({a, b} <= group for group in (*tracing.equivalent, *tracing.near))
+    ]
+    if not pairs:
+        return ()
+    mean = _predictions(search, likely, actions)
+
+    def is_close(pair: frozenset[str]) -> bool:
+        a, b = pair
+        gap = mean[a] - mean[b]
+        gap = gap[np.isfinite(gap)]
+        return gap.size > 0 and float(np.mean(gap**2)) < 1
+
+    return tuple(pair for pair in pairs if is_close(pair))
+
+
+def _predictions(
+    search: Search, names: Sequence[str], actions: ActionSpace | None
+) -> dict[str, Array]:
+    """Return what each effect predicts at its best fit, in deviations, (N,) each."""
+    models = {name: search.model(ModelKey((name,))) for name in names}
+    if actions is None:
+        return {n: -m.scale * m.residual[: m.num] for n, m in models.items()}
+    rivals, predicted = search.rivals, {}
+    trials = every_action(rivals, actions)
+    seed = derive_seed(rivals.seed, "aliases")
+    simulator = TrialSimulator(rivals.simulator.model, trials, seed=seed)
+    unit = noise_unit(rivals, simulator)
+    for name, model in models.items():
+        coordinates = rivals.rival(model.key).coordinates
+        theta, phi = coordinates.split(model.u[None])
+        for effect in rivals.nuisances:
+            null = effect.null_phi(len(trials), finite=True)
+            phi[effect.name] = null.reshape(1, len(trials), -1)
+        predicted[name] = simulator.predict(theta, phi)[0][0] / unit
+    return predicted

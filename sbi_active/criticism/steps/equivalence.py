@@ -102,6 +102,15 @@ def equivalent_effects(
     return tuple(g for g in found if len(g) > 1)
 
 
+def noise_unit(rivals: RivalSet, simulator: TrialSimulator) -> Array:
+    """Return the size that counts as large in each number of trials, shape (N,)."""
+    noise = declared_noise(rivals.model.noise, simulator.measurements)
+    unit = noise.typical_sd
+    if rivals.model.noise is None:
+        unit = np.full(len(unit), np.median(rivals.spread))
+    return unit
+
+
 class _World:
     """Predictions of trials, in noise units.
 
@@ -115,10 +124,7 @@ class _World:
             rivals.simulator.model, trials, seed=derive_seed(rivals.seed, "equivalence")
         )
         self.prior, self.is_smooth = rivals.prior, rivals.is_smooth
-        noise = declared_noise(rivals.model.noise, self.simulator.measurements)
-        self.unit = noise.typical_sd
-        if rivals.model.noise is None:
-            self.unit = np.full(len(self.unit), np.median(rivals.spread))
+        self.unit = noise_unit(rivals, self.simulator)
         self.step = max(rivals.step, 1e-4)  # from the null, in deviations of the prior
         self.coordinates = SearchCoordinates(self.prior, (), (), len(trials))
 

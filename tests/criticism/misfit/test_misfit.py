@@ -5,12 +5,14 @@ import pytest
 import torch
 from scipy.stats import multivariate_normal
 
-from sbi_active import SimulatorModel
+from sbi_active import DiscreteActions, SimulatorModel
 from sbi_active.criticism import Criticism, Trials, close_loop
 from sbi_active.criticism.linear.mixture import summed
 from sbi_active.criticism.linear.screening import linear_models
+from sbi_active.criticism.misfit import record
 from sbi_active.criticism.misfit.guesses import MARGIN, guess_residual
 from sbi_active.criticism.results import ModelKey
+from sbi_active.criticism.steps.detection import THRESHOLD
 from sbi_active.simulation import AutocorrelatedNoise
 from tests.criticism.misfit.oscillator import (
     ACTION,
@@ -23,7 +25,8 @@ from tests.criticism.misfit.oscillator import (
 )
 from tests.criticism.misfit.oscillator import trials as recorded
 from tests.criticism.steps.linear_world import ACTION as NUMBERS
-from tests.criticism.steps.linear_world import measured, rivals
+from tests.criticism.steps.linear_world import NOISE, judged, measured, rivals
+from tests.effects import on_outcomes
 
 HIDDEN, LAG = 0.6, 0.3
 
@@ -162,6 +165,59 @@ def test_ordinary_misfit_sets_nothing_aside():
     found = loop_of(recorded(lag=0.3, hidden=0.6))
     assert found.misfit() is not None
     assert found.set_aside == ()
+
+
+# Effects that the noise hides from each other
+
+
+SIZE = 0.5
+X = measured(curve=SIZE)
+ACTIONS = DiscreteActions(torch.linspace(-2, 2, 12))
+PAIR = frozenset({"curve", "twin"})
+
+
+def like_the_verdict(some, actions):
+    found = judged(some)
+    tracing, _ = record.traced(found, None, near=False)
+    return record.like_the_verdict(found, tracing, actions)
+
+
+def twin(distance):
+    """Return the curve with a wave of a root mean square, in noise deviations."""
+    size = distance * NOISE / SIZE * 2**0.5
+    return on_outcomes(
+        "twin",
+        lambda x, phi, action, context: (
+            x + phi * (action**2 - 1 + size * torch.sin(5 * action))
+        ),
+    )
+
+
+def test_effects_closer_than_the_noise_are_nearly_the_same():
+    assert like_the_verdict(rivals(X, twin(0.3)), ACTIONS) == (PAIR,)
+
+
+def test_effects_apart_by_more_over_the_permitted_actions_are_not():
+    # Between the trials at hand they hardly differ; beyond them they do.
+    other = on_outcomes(
+        "twin",
+        lambda x, phi, action, context: (
+            x + phi * (action**2 - 1 + torch.relu(action.abs() - 2) ** 3)
+        ),
+    )
+    some = rivals(X, other)
+    assert like_the_verdict(some, None) == (PAIR,)
+    assert like_the_verdict(some, DiscreteActions(torch.linspace(-4, 4, 12))) == ()
+
+
+def test_an_effect_that_the_trials_refute_is_not_like_the_verdict():
+    assert like_the_verdict(rivals(X), ACTIONS) == ()
+    # Closer than the noise, and yet refuted by these trials.
+    some = rivals(measured(curve=SIZE, seed=4), twin(0.95))
+    states = judged(rivals(measured(curve=SIZE, seed=4), twin(0.95))).states
+    curve, other = (states.log_evidence(ModelKey((n,))) for n in ("curve", "twin"))
+    assert curve - other > THRESHOLD
+    assert like_the_verdict(some, ACTIONS) == ()
 
 
 # What the residual follows where no declared effect helps
