@@ -84,17 +84,18 @@ def gate_of(
         likely: Probability of the bare model below which trials decide nothing, though
             they raise no alarm.
     """
-    tracing, scored = report.tracing, report.evaluation
+    scored = report.evaluation
     num = 0 if scored is None else len(scored.trials)
     if scored is None or num < fewest:
+        if report.verdict == OUTLIER:
+            return _contradicts(report)
         reason = f"{num} trials were scored that had no part in the fit, and {fewest} "
-        return Gate("NOT_ENOUGH_DATA", f"{reason}are needed; {MORE}", {"scored": num})
+        reason += f"are needed, held out or each predicted by three others; {MORE}"
+        return Gate("NOT_ENOUGH_DATA", reason, {"scored": num})
     if (narrow := _beyond_prior(report, level)) is not None:
         return narrow
     if report.verdict == OUTLIER:
-        reason = "one trial does not agree with the others; check and repeat it"
-        names = [tracing.trial_names.get(i, i) for i in tracing.outliers]
-        return Gate("NOT_ENOUGH_DATA", reason, {"trials": names[:1]})
+        return _contradicts(report)
     if report.verdict != NONE:
         return _wrong(report)
     missed = [trial.name for trial in scored.missed]
@@ -117,6 +118,14 @@ def gate_of(
     reason = f"the simulator predicts {num} trials that had no part in its fit, with a "
     reason += f"root mean square error of {number(before)}"
     return Gate("SHIP", reason, {"scored": num, "before": before, "after": after})
+
+
+def _contradicts(report: Contents) -> Gate:
+    """Return the decision where one trial does not agree with the others."""
+    tracing = report.tracing
+    names = [tracing.trial_names.get(i, i) for i in tracing.outliers][:1]
+    reason = f"trial {names[0]} does not agree with the others; check and repeat it"
+    return Gate("NOT_ENOUGH_DATA", reason, {"trials": names})
 
 
 def _worst(report: Contents) -> dict[str, Any]:

@@ -7,7 +7,7 @@ import torch
 from sbi.utils import BoxUniform
 
 from sbi_active import DiscreteActions, GaussianNoise, SimulatorModel
-from sbi_active.criticism import Trials, close_loop
+from sbi_active.criticism import Trials, close_loop, generic_effects
 from sbi_active.criticism.report.gate import EXIT_CODES
 from tests.effects import BIAS
 
@@ -126,3 +126,16 @@ def test_few_trials_are_not_enough():
     gate = decided(lambda xi, fits: 0.7 * xi, fitted=3, held_out=1)
     assert gate.decision == "NOT_ENOUGH_DATA"
     assert "measure more" in gate.reason
+
+
+def test_three_trials_of_which_one_contradicts():
+    block = SimulatorModel(
+        lambda theta, v: v**2 / (19.62 * theta), noise=GaussianNoise(0.005)
+    )
+    prior = BoxUniform(torch.tensor([0.1]), torch.tensor([1.0]))
+    trials = Trials([1.0, 2.0, 3.0], [0.127, 0.510, 2.3])
+    effects = generic_effects(block, trials, prior=prior)
+    gate = close_loop(block, prior, trials, effects=effects, plan=False).gate
+    assert gate.decision == "NOT_ENOUGH_DATA"
+    assert gate.details == {"trials": ["2"]}
+    assert "trial 2 does not agree" in gate.reason
