@@ -193,11 +193,11 @@ class Pool:
         """
         u = potential.simulated(drawn)
         log_prior = potential.log_prior(u)
+        u, log_prior = u[np.isfinite(log_prior)], log_prior[np.isfinite(log_prior)]
         log_likelihood = potential.log_likelihood(u, floor=floor - log_prior)
         counts = np.isfinite(log_likelihood)
-        u, log_likelihood, log_prior = (
-            v[counts] for v in (u, log_likelihood, log_prior)
-        )
+        u, log_prior = u[counts], log_prior[counts]
+        log_likelihood = log_likelihood[counts]
         own = np.log(len(drawn)) + proposal.log_prob(self.u)
         self.log_mixture = np.logaddexp(self.log_mixture, own)
         count = len(drawn)
