@@ -122,7 +122,8 @@ def choose_estimator(
             by_noise = NestedGain()
         problems = by_noise.problems(simulations)
         if not problems:
-            return by_noise, []
+            is_nested = isinstance(by_noise, NestedGain)
+            return by_noise, by_noise.doubts(simulations) if is_nested else []
         notes = [f"{type(by_noise).__name__} not used: {text}" for text in problems]
     if hasattr(model, "log_posterior"):
         return PosteriorGain(), notes

@@ -7,6 +7,7 @@ import torch
 from sbi.utils import BoxUniform
 
 from sbi_active.design import EntropyGain, NestedGain
+from sbi_active.design.estimators.automatic import choose_estimator
 from sbi_active.design.estimators.base import CandidateSimulations
 from sbi_active.design.estimators.emulator import MeanEmulator, declare
 from sbi_active.simulation import GaussianNoise
@@ -50,7 +51,7 @@ def test_six_numbers_that_four_parameters_make():
     """Gains of .3 to 7.6 nats; the emulator bends where the sensor saturates."""
     index = torch.tensor([6, 16, 23, 33])
     rows, prior = oscillator(400, index)
-    assert NestedGain().problems(rows) == []
+    assert NestedGain().problems(rows) == NestedGain().doubts(rows) == []
     gain, error = estimate(rows, prior)
     exact, exact_error = OscillatorReference([], []).expected_information_gain(
         model.ACTIONS[index], num_outer=200, num_inner=50_000
@@ -61,6 +62,22 @@ def test_six_numbers_that_four_parameters_make():
     # nearest neighbors in six dimensions do not do it
     coarse = EntropyGain()(None, rows, prior).mean(1)
     assert (coarse - exact).abs().max() > 1.0
+
+
+def test_outcomes_that_the_emulator_misses_at_one_action_are_noticed():
+    """Smooth at one action and rough at another: half of the numbers pass the check."""
+    torch.manual_seed(0)
+    theta = PRIOR.sample((200,))
+    rough = torch.cat([theta, theta, theta, 10 * torch.sin(50 * theta)], 1)
+    mean = torch.stack([theta.repeat(1, 4), rough])
+    noise = GaussianNoise(0.1)
+    rows = CandidateSimulations(
+        theta, torch.zeros(2, 1), noise.sample(mean), mean=mean, noise=noise
+    )
+    assert NestedGain().problems(rows) == []
+    (doubt,) = NestedGain().doubts(rows)
+    assert "misses 9" in doubt or "misses 100%" in doubt
+    assert choose_estimator(None, rows)[1] == [doubt]
 
 
 def test_noise_that_is_not_declared_is_learned():
