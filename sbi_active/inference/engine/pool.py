@@ -153,7 +153,9 @@ class Pool:
     def standard_error(self) -> float:
         """Standard error of log_evidence."""
         effective, num = self.effective_sample_size, max(self.num_final, 1)
-        return float(np.sqrt(max(1 / max(effective, 1e-9) - 1 / num, 0.0)))
+        square = max(1 / max(effective, 1e-9) - 1 / num, 0.0)
+        of_mass = 0.0 if self.final is None else self.final.error
+        return float(np.hypot(np.sqrt(square), of_mass))
 
     def restart(self) -> None:
         """Rest the posterior on draws to come."""

@@ -17,7 +17,13 @@ from sbi_active.inference.sampling.weights import log_sum_exp, systematic
 
 
 class Proposal(Protocol):
-    """A density that can be sampled."""
+    """A density that can be sampled.
+
+    Attributes:
+        error: Standard error of its log density, nats, where its mass was estimated.
+    """
+
+    error: float = 0.0
 
     def sample(self, num_samples: int, rng: np.random.Generator) -> Array:
         """Return draws, shape (n, d)."""
