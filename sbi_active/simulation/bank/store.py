@@ -18,6 +18,7 @@ import json
 import os
 import secrets
 import sqlite3
+import stat
 import threading
 import weakref
 from collections.abc import Iterator
@@ -331,9 +332,13 @@ def _connected(path: Path, mode: str, *, timeout: float) -> sqlite3.Connection:
     """
     for end in ("", "-wal", "-shm", "-journal"):
         file = path.with_name(path.name + end)
-        plain = file.is_file() and not file.is_symlink() and end != "-journal"
+        try:
+            mode_of = file.lstat().st_mode
+        except FileNotFoundError:
+            continue  # asked once: another process may begin it meanwhile
+        is_plain = stat.S_ISREG(mode_of) and end != "-journal"
         reason = f"{file.name}, a link, no file, or a journal, which none leaves"
-        whole(path, plain or not os.path.lexists(file), reason)
+        whole(path, is_plain, reason)
     place = f"file:{quote(str(path.absolute()))}?mode={mode}"
     how: Any = {"isolation_level": None, "check_same_thread": False}
     return sqlite3.connect(place, uri=True, timeout=timeout, **how)
