@@ -193,7 +193,7 @@ def posterior_bounds(
 
 
 @dataclass(frozen=True)
-class _StandardNormal:
+class _StandardNormal(Proposal):
     """The prior, as a proposal."""
 
     dim: int
