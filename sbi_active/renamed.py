@@ -11,7 +11,6 @@ import pkgutil
 import sys
 from collections.abc import Callable, Mapping
 from dataclasses import fields, replace
-from pathlib import Path
 from typing import Any, TypeVar
 
 from sbi_active.expected import suggests
@@ -54,7 +53,8 @@ def lazy_names(
         package: Name of the package.
         former: Former names, see :func:`former_names`.
     """
-    tree = ast.parse(Path(str(sys.modules[package].__file__)).read_text("utf-8"))
+    loader: Any = getattr(sys.modules[package].__spec__, "loader", None)
+    tree = ast.parse(loader.get_source(package))  # of a zipped package as well
     blocks = [node for node in tree.body if isinstance(node, ast.If)]
     home = {
         alias.name: line.module

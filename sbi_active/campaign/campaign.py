@@ -18,7 +18,7 @@ from sbi_active.campaign.isolation import guarded, isolated
 from sbi_active.campaign.learning.methods import find_method
 from sbi_active.campaign.learning.planner import Planner
 from sbi_active.campaign.learning.pooled import make_learner
-from sbi_active.campaign.learning.revision import recompute, require_kind, revise
+from sbi_active.campaign.learning.revision import recompute, revise
 from sbi_active.campaign.options import CampaignOptions
 from sbi_active.campaign.state import CampaignState, Trial
 from sbi_active.campaign.storage.directory import Storage, make_campaign, stored
@@ -183,7 +183,6 @@ class Campaign(CampaignTrials):
             ValueError: If there is no campaign, or one of another simulator or schema.
             CorruptSegmentError: If a file does not hold what was written.
         """
-        require_kind(effects)
         given = {
             "prior": prior,
             "actions": None if actions is None else action_space(actions),

@@ -11,7 +11,6 @@ from torch import Tensor
 from torch.distributions import Distribution
 
 from sbi_active.actions import ActionSpace
-from sbi_active.callers import stack_level
 from sbi_active.criticism.data.input_series import require_covered
 from sbi_active.criticism.data.trials import Trials
 from sbi_active.criticism.data.units import split
@@ -129,7 +128,6 @@ def require_fitting(
                 f"SA210 the trials have {name}, and the simulator's function takes no "
                 f"argument {name!r}: they are not used; write fn(theta, action, *, "
                 f"{name})",
-                stacklevel=stack_level(),
             )
     if trials.inputs is not None and has_own_times(model, trials):
         times, grid = model.sample_times, trials.input_times
@@ -195,7 +193,6 @@ def _warn_outside(trials: Trials, actions: ActionSpace) -> None:
         f"SA202 the executed action {trials.action[places[0]].tolist()} of trial "
         f"{trials.names[places[0]]} is not in {actions} ({trials.called(places)}); it "
         "is simulated where it was executed",
-        stacklevel=stack_level(),
     )
 
 

@@ -12,7 +12,6 @@ from torch.distributions import Distribution
 
 from sbi_active.actions import ActionSpace
 from sbi_active.actions.discrete import Actions, action_space
-from sbi_active.callers import stack_level
 from sbi_active.design.design import Design
 from sbi_active.design.elimination import GainEvaluator, as_batch, eliminate
 from sbi_active.design.estimators.automatic import by_name, find_estimator
@@ -239,7 +238,6 @@ class InformationGainDesigner(Shown):
                 "of the design are missing, by faults of the simulator; they were left "
                 "out",
                 MissingRowsWarning,
-                stacklevel=stack_level(),
             )
         return design
 

@@ -168,7 +168,8 @@ class GainEvaluator:
             return drawn
         self._is_settled = True
         if self._chosen is not None:
-            self.notes = self._chosen.problems(drawn)
+            chosen = self._chosen
+            self.notes = [*chosen.problems(drawn), *chosen.doubts(drawn)]
             return drawn
         num_rows = num_samples // 2 if halves else num_samples
         self._chosen, self.notes = choose_estimator(

@@ -11,7 +11,6 @@ import numpy as np
 import pandas as pd
 
 from sbi_active.arrays import Array
-from sbi_active.callers import stack_level
 from sbi_active.criticism.data.cells import Cells, read_csv
 from sbi_active.criticism.data.columns import find_columns
 from sbi_active.criticism.data.tables import find_recordings
@@ -205,7 +204,6 @@ def _note_spacing(time: Array, step: float, what: str) -> None:
             f"SA204 {what} has a sample every {spacing:g} s, {spacing / step:,.0f} "
             f"time steps of {step:g} s, and asks for {time[-1] / step:,.0f} steps: is "
             "its time in ms? Convert it to seconds, or raise the time step",
-            stacklevel=stack_level(),
         )
 
 
@@ -229,7 +227,6 @@ def _note_angles(model: Any, channel: Channel, x: Array, what: str) -> None:
                 f"SA205 {channel.name} in {what} jumps by about {unit} in "
                 f"{int(wraps.sum())} places, as an angle that wraps: pass "
                 "numpy.unwrap of it",
-                stacklevel=stack_level(),
             )
     joint = scalar_joints(model).get(channel.name)
     if joint is not None:
@@ -239,5 +236,4 @@ def _note_angles(model: Any, channel: Channel, x: Array, what: str) -> None:
                 f"SA206 {channel.name} in {what} reaches {np.abs(seen).max():g}, "
                 f"where its joint's range ends at {limit:g} rad: are these degrees? "
                 "Convert them",
-                stacklevel=stack_level(),
             )

@@ -15,7 +15,7 @@ from sbi_active.actions import ActionSpace, DiscreteActions
 from sbi_active.campaign.learning.learner import Learner
 from sbi_active.campaign.learning.methods import find_method
 from sbi_active.campaign.learning.pooled import PooledLearner
-from sbi_active.campaign.learning.revision import compare, require_kind
+from sbi_active.campaign.learning.revision import compare
 from sbi_active.campaign.state import CampaignState, Trial
 from sbi_active.design.design import Design, action_labels, equal_errors
 from sbi_active.design.designer import InformationGainDesigner
@@ -64,7 +64,6 @@ class Planner:
             require_nested,
         )
 
-        require_kind(effects)
         require_distinct(effects)
         require_nested(effects)
         self._state, self.effects = state, (*effects,)

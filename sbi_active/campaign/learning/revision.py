@@ -43,6 +43,7 @@ def compare(
     """
     # Criticism reads results of everything below, so it is imported where it is used.
     from sbi_active.criticism import Criticism, Trials
+    from sbi_active.criticism.effects.declarations import require_kind
 
     require_kind(effects)
     if len(trials) < 2:
@@ -120,18 +121,6 @@ def revise(state: CampaignState, actions: ActionSpace, report: Report) -> Learne
     return revised
 
 
-def require_kind(effects: Sequence[Effect]) -> None:
-    """Raise a TypeError if effects are none, as where their names are given."""
-    from sbi_active.criticism import Effect
-
-    for effect in effects:
-        if not isinstance(effect, Effect):
-            raise TypeError(
-                f"expected effects of class Effect; got {effect!r:.80}; pass "
-                "Effect(...), or those of generic_effects(...)"
-            )
-
-
 def require_effects(what: str, names: Sequence[str], effects: Sequence[Effect]) -> None:
     """Raise a ValueError if effects of a campaign are not among those that are given.
 
@@ -140,6 +129,9 @@ def require_effects(what: str, names: Sequence[str], effects: Sequence[Effect]) 
         names: Names of effects.
         effects: Effects that are given.
     """
+    from sbi_active.criticism.effects.declarations import require_kind
+
+    require_kind(effects)
     lacking = {*names} - {effect.name for effect in effects}
     got = f"none named {', '.join(sorted(map(str, lacking)))}"
     advice = "pass effects= as they were declared"

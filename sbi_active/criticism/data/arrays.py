@@ -10,7 +10,6 @@ import torch
 from torch import Tensor
 
 from sbi_active.arrays import measured
-from sbi_active.callers import stack_level
 from sbi_active.expected import require
 from sbi_active.messages import warn
 
@@ -70,7 +69,6 @@ def without_inf(x: Tensor, names: Sequence[str]) -> Tensor:
         warn(
             f"SA201 x is inf in trial{'s' * (len(lost) > 1)} {which}: taken as not "
             "measured, as NaN is",
-            stacklevel=stack_level(),
         )
     return x.where(x.isfinite(), torch.nan)
 

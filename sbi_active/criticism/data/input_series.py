@@ -10,7 +10,6 @@ import torch
 from torch import Tensor
 
 from sbi_active.arrays import Array
-from sbi_active.callers import stack_level
 from sbi_active.criticism.data.arrays import padded
 from sbi_active.expected import require
 from sbi_active.messages import warn
@@ -292,7 +291,6 @@ def _require_one_origin(
         f"SA208 trials {', '.join(each[0] for each in late)} begin up to {after:g} "
         "after the earliest, and hold their first inputs until then: "
         f"{remedy} where a simulator starts there",
-        stacklevel=stack_level(),
     )
 
 

@@ -18,7 +18,6 @@ import numpy as np
 import pandas as pd
 
 from sbi_active.arrays import Array
-from sbi_active.callers import stack_level
 from sbi_active.criticism.data.cells import Cells, read_csv
 from sbi_active.criticism.data.columns import (
     OPTIONAL,
@@ -207,7 +206,6 @@ def _trials(cells: Cells, beside: Cells | None) -> dict[str, Any]:
                 f"SA209 {len(lost)} rows of {cells.source} have a measurement and no "
                 f"input, the first in {cells.place(lost[0])}; there the input before "
                 "holds",
-                stacklevel=stack_level(),
             )
         # Inputs may come more often than x: then a row without x is no sample.
         only = given & ~filled
@@ -323,7 +321,6 @@ def _note_empty(cells: Cells, x: Array, rows: Array) -> None:
                 f"SA203 {len(at)} of {len(rows)} cells of column {column.header} in "
                 f"{cells.source} hold no number: {some}{more}; they count as not "
                 "measured",
-                stacklevel=stack_level(),
             )
 
 
@@ -354,5 +351,4 @@ def _note_scales(
         f"SA207 {header} of {'trials' if cells.is_named else 'rows'} {which} in "
         f"{cells.source} is about {factor:.0f} times {word} than that of the others: "
         "check that all are in one unit",
-        stacklevel=stack_level(),
     )

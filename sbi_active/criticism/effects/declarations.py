@@ -7,7 +7,6 @@ from collections.abc import Sequence
 import torch
 
 from sbi_active.criticism.effects.effect import NUM_DRAWS, Effect
-from sbi_active.expected import require
 
 
 def require_nested(effects: Sequence[Effect]) -> None:
@@ -25,6 +24,16 @@ def require_nested(effects: Sequence[Effect]) -> None:
             )
 
 
+def require_kind(effects: Sequence[Effect]) -> None:
+    """Raise a TypeError if effects are none, as where their names are given."""
+    for effect in effects:
+        if not isinstance(effect, Effect):
+            raise TypeError(
+                f"expected effects of class Effect; got {effect!r:.80}; pass "
+                "Effect(...), or those of generic_effects(...)"
+            )
+
+
 def require_distinct(effects: Sequence[Effect], parameters: Sequence[str] = ()) -> None:
     """Raise if two numbers would have one name in tables and records.
 
@@ -33,10 +42,7 @@ def require_distinct(effects: Sequence[Effect], parameters: Sequence[str] = ()) 
             again either, since that joins names, and those of the entries of their phi.
         parameters: Names of the simulator's own.
     """
-    for effect in effects:
-        advice = "declare Effect(name, ...), or take one of generic_effects"
-        is_one = isinstance(effect, Effect)
-        require(is_one, "effects of class Effect", repr(effect), advice)
+    require_kind(effects)
     parts = [part for effect in effects for part in effect.name.split(" + ")]
     _require_once(parts, "effects with distinct names")
     shown = [effect for effect in effects if effect.scope == "campaign"]

@@ -27,7 +27,6 @@ from torch import Tensor
 from torch.distributions import Independent, Normal
 
 from sbi_active.arrays import Array
-from sbi_active.callers import stack_level
 from sbi_active.criticism.data.arrays import repeated
 from sbi_active.criticism.data.trials import Trials
 from sbi_active.criticism.effects.changes import Wrapped
@@ -107,7 +106,6 @@ def start_from_first_samples(
             f"polynomial of order {degree} by more than the sensor's error, so that "
             "their start is wrong and hides what bends them, such as gravity: name a "
             f"derivative of order {degree + 1} as well, or pass a shorter within",
-            stacklevel=stack_level(),
         )
     copy = trials.select(slice(None))
     shown = dict(zip(start, torch.from_numpy(values.T.copy()), strict=True))

@@ -9,7 +9,6 @@ import torch
 from torch import Tensor
 from torch.distributions import Distribution
 
-from sbi_active.callers import stack_level
 from sbi_active.design.estimators.base import (
     CandidateSimulations,
     InformationGainEstimator,
@@ -77,7 +76,6 @@ def by_name(
         warn(
             f"SA701 {what}={name!r} goes in the next version: use "
             f'{what}="{former[name]}", or "auto"',
-            stacklevel=stack_level(),
         )
         name = former[name]
     if name not in known:
@@ -122,8 +120,7 @@ def choose_estimator(
             by_noise = NestedGain()
         problems = by_noise.problems(simulations)
         if not problems:
-            is_nested = isinstance(by_noise, NestedGain)
-            return by_noise, by_noise.doubts(simulations) if is_nested else []
+            return by_noise, by_noise.doubts(simulations)
         notes = [f"{type(by_noise).__name__} not used: {text}" for text in problems]
     if hasattr(model, "log_posterior"):
         return PosteriorGain(), notes

@@ -201,6 +201,10 @@ class InformationGainEstimator(Shown, ABC):
         """Say in short sentences what speaks against the estimator here."""
         return []
 
+    def doubts(self, simulations: CandidateSimulations) -> list[str]:
+        """Say where estimates are off, though nothing else is likely to do better."""
+        return []
+
     def remarks(self, simulations: CandidateSimulations) -> list[str]:
         """Return remarks on an estimate from simulations."""
         return []

@@ -101,8 +101,8 @@ def test_most_draws_of_a_bent_posterior_count():
     assert isinstance(found.pool.final, Screened)
     exact = evidence_of_bent(0.1, 2.0)
     assert 0 < found.pool.final.error < found.standard_error
-    error = found.standard_error
-    assert found.log_evidence == pytest.approx(exact, abs=4 * error + 0.01)
+    error = 4 * found.standard_error + 0.01  # of the reference's own draws
+    assert found.log_evidence == pytest.approx(exact, abs=error)
     assert found.effective_sample_size > 0.5 * found.pool.num_final
     assert found.tail_shape < 0.7
 
