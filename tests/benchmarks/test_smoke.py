@@ -67,10 +67,20 @@ def test_a_case_of_misfit_is_run_once_and_its_row_is_whole(tmp_path, capsys):
 
 def test_the_truth_of_a_case_runs_the_trial_that_was_drawn():
     case = misfit_cases.draw_case("own", "E", 330)
-    truth, reality = case.truth, Reality.of(case, 330)
+    truth, reality = case.truth, Reality.of(330, "E", 1.0)
     reality.index = k = int(truth.fitted[-1])  # as if it were the next one
     x = reality.run(truth.action[k])
     assert torch.allclose(x, truth.measured(torch.tensor([k]))[0])
+    assert reality.index == k + 1
+
+
+def test_permitted_actions_reach_beyond_those_of_the_trials():
+    near, far = (Reality.of(6_000, "B outside", reach) for reach in (1.0, 1.5))
+    tried = far.problem.trials.fit.action.abs().max()
+    assert near.actions.values.abs().max() <= 3.0 < far.actions.values.abs().max()
+    assert far.actions.values.abs().max() > tried
+    assert far.run(far.actions.values[0]).shape == far.problem.trials.x.shape[1:]
+    assert not far.right & {e.name for e in far.problem.effects}
 
 
 def test_what_is_removed_is_not_named_and_aliases_are_counted():

@@ -20,6 +20,35 @@ from sbi_active.inference.sampling.weights import effective_sample_size, normali
 
 
 @dataclass(frozen=True)
+class Spread:
+    """Errors of predictions where every model misses, by those on left-out trials.
+
+    A number errs by the sensor and the residual process, which together are as large as
+    the residuals of its channel, and by what the parameters are unsure of: more where
+    the trials so far tell less. Both are as many times larger, or smaller, as left-out
+    trials say.
+
+    Attributes:
+        size: Root mean square residual of each channel, in units of x, shape (c,).
+        square: Mean squared error of each left-out part, in units of what both expect
+            of it, shape (f,).
+    """
+
+    size: Array
+    square: Array
+
+    @property
+    def scale(self) -> float:
+        """Root mean square error on left-out parts, in units of what is expected."""
+        return float(np.sqrt(np.mean(self.square))) if len(self.square) else 1.0
+
+    @property
+    def sizes(self) -> Array:
+        """Standard deviation of errors given the parameters by channel, shape (c,)."""
+        return self.scale * self.size
+
+
+@dataclass(frozen=True)
 class Fit:
     """A rival fitted to the trials.
 
@@ -34,6 +63,7 @@ class Fit:
         linear: Function from u (n, dim) to the residuals (n, N) of the linear model
             that draws are of; None if they are of the simulator's own posterior.
         known: Mask of the numbers that it is fitted to, shape (N,); None for all.
+        spread: Errors of its predictions if every model misses; None else.
     """
 
     rival: Rival
@@ -43,6 +73,7 @@ class Fit:
     mode: Array | None = None
     linear: Callable[[Array], Array] | None = None
     known: NDArray[np.bool_] | None = None
+    spread: Spread | None = None
 
     @property
     def error(self) -> NoiseGrid | ResidualProcess:

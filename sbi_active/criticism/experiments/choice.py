@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import takewhile
 
 import numpy as np
@@ -14,14 +14,14 @@ from scipy.spatial.distance import cdist
 from scipy.special import gammaln
 
 from sbi_active.criticism.criticism import Criticism
-from sbi_active.criticism.misfit.verdict import Verdict
 from sbi_active.criticism.next_trial.candidates import following
 from sbi_active.criticism.report.predicted import Registered, TestedTrial
 from sbi_active.criticism.report.report import Report
 from sbi_active.criticism.results import NONE, UNEXPLAINED, Array, ModelKey
-from sbi_active.criticism.steps.predictive import Prediction, predict
+from sbi_active.criticism.steps.predictive import predict
 from sbi_active.expected import suggests
 from sbi_active.inference.sampling.weights import normalized
+from sbi_active.messages import Message
 from sbi_active.seeding import derive_seed
 
 #: Probability with which an outcome lies within the registered interval.
@@ -139,6 +139,37 @@ def failures(
     return [f"{told} of {len(own)} that tested it, and is the verdict still"]
 
 
+def unless_untested(report: Report, tested: Sequence[TestedTrial]) -> Report:
+    """Return a report that names no effect by trials that it did not predict.
+
+    Where every model misses, whatever fits the last trial best is an explanation in
+    hindsight. An effect is named if a model that had it predicted one of the trials
+    that tested verdicts, and held; else it helps, and is not named.
+
+    Args:
+        report: Report with the verdict on all trials.
+        tested: Trials that were run.
+    """
+    tracing, misfit = report.tracing, report.tracing.misfit
+    told = [trial for trial in tested if trial.is_measured]
+    if misfit is None or not told:
+        return report
+    shown = {n for trial in told if trial.held for n in trial.registered.effects}
+    named = tuple(n for n in misfit.named if n in shown)
+    if named == misfit.named:
+        return report
+    new = str(ModelKey(tuple(n for n in misfit.named if n not in shown)))
+    said = f"SA533 {new} explains the trials that were run, and predicted none of them"
+    tracing = replace(
+        tracing,
+        verdict=str(ModelKey(named)) if named else UNEXPLAINED,
+        beside=tuple(n for n in tracing.chosen if n not in named),
+        misfit=replace(misfit, named=named),
+    )
+    warnings = (*report.warnings, Message(f"{said}: run one that tests it"))
+    return replace(report, tracing=tracing, warnings=warnings)
+
+
 def is_settled(
     report: Report, tested: Sequence[TestedTrial], settling: Settling
 ) -> bool:
@@ -188,10 +219,10 @@ def register(
     mean, sd = prediction.moments()
     distance = np.sqrt((((prediction.x - mean) / sd) ** 2).mean(1))
     limit = float(np.quantile(distance, COVERAGE))
-    if (verdict := criticism.misfit()) is not None:
+    spread = rivals.fit(report.tracing.key).spread
+    if spread is not None:
         mean = prediction.middle
-        key = ModelKey(report.tracing.chosen)
-        sd, limit = _by_left_out(verdict, key, prediction)
+        limit = limit_of(spread.square, len(mean)) / spread.scale
     return Registered(
         index=index,
         action=choice.action,
@@ -202,38 +233,8 @@ def register(
         position=prediction.measurements.position,
         limit=limit,
         bare=bare.middle,
+        effects=report.tracing.key.effects,
     )
-
-
-def _by_left_out(
-    verdict: Verdict, key: ModelKey, prediction: Prediction
-) -> tuple[Array, float]:
-    """Return deviations (N,) of a prediction, and its limit by left-out trials.
-
-    A number errs by the sensor and the residual process, which together are as large as
-    the residuals of its channel, and by what the parameters are unsure of: more where
-    the trials so far tell less.
-
-    Args:
-        verdict: The models, where every one misses.
-        key: Key of the model that predicts.
-        prediction: Its prediction of one trial.
-    """
-    search, cov = verdict.search, verdict.covariance(key)
-    own = search.found[key]
-    m, fold, model = search.errors.measurements, search.errors.fold, own.model
-    rows = model.scale[:, None] * model.rows[: model.num]  # in sensor deviations
-    residual = m.by_channel(rows[:, 0] ** 2)
-    known = ((rows[:, 1:] @ cov) * rows[:, 1:]).sum(1)
-    each = own.left.error**2 / (np.maximum(residual, TINY)[m.channel] + known)
-    use = np.isfinite(own.left.square)
-    kept = search.errors.is_scored & use[fold]
-    square = np.bincount(fold[kept], each[kept], len(use))[use]
-    square /= np.bincount(fold[kept], minlength=len(use))[use]
-    own_size = m.by_channel((search.unit * rows[:, 0]) ** 2)
-    channel = prediction.measurements.channel
-    sd = np.sqrt(own_size[channel] + prediction.mean.var(0))
-    return sd, limit_of(square, len(channel))
 
 
 def limit_of(square: Array, most: int, num: int = 25) -> float:

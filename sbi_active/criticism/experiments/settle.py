@@ -23,6 +23,7 @@ from sbi_active.criticism.experiments.choice import (
     failures,
     is_settled,
     register,
+    unless_untested,
 )
 from sbi_active.criticism.report.predicted import Registered, TestedTrial
 from sbi_active.criticism.report.report import Report
@@ -119,6 +120,7 @@ def settle(
         report = criticism.report(designed=designed or bool(tested))
         if stopped == SETTLED and not is_settled(report, tested, settling):
             stopped = "left-out trials speak against the verdict"
+    report = unless_untested(report, tested)
     warnings = (*report.warnings, *map(Message, failures(report, tested)))
     return replace(report, tested=(*tested,), stopped=stopped, warnings=warnings)
 
@@ -236,9 +238,10 @@ class Journal:
 
 
 def _registered(event: dict[str, Any]) -> Registered:
-    own = {f.name: event[f.name] for f in fields(Registered)}
+    own = {f.name: event[f.name] for f in fields(Registered) if f.name in event}
+    effects = tuple(own.pop("effects", ()))
     arrays = {k: np.asarray(v) for k, v in own.items() if isinstance(v, list)}
-    return Registered(**{**own, **arrays})
+    return Registered(**{**own, **arrays}, effects=effects)
 
 
 def _read(path: Path) -> list[dict[str, Any]]:

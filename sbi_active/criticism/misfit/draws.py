@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sbi_active.arrays import Array
-from sbi_active.criticism.evidence.fit import Fit
+from sbi_active.criticism.evidence.fit import Fit, Spread
 from sbi_active.criticism.evidence.rival_set import NUM_DRAWS, RivalSet
 from sbi_active.criticism.linear.fits import refitted
 from sbi_active.criticism.linear.mixture import Mixture
@@ -130,7 +130,7 @@ def _linear(
     rival = models.rival(key, suspect=found.suspect if key.error == OUTLIER else None)
     model = search.model(states.predicting(key))
     seed = derive_seed(models.seed, "linear", str(model.key))
-    best, mode, square = None, model.u, model.chi_square[0]
+    best, mode, square, spread = None, model.u, model.chi_square[0], None
     linear: Callable[[Array], Array] | None = None
 
     def drawn(center: Array, cov: Array) -> Array:
@@ -140,7 +140,7 @@ def _linear(
         log_z, best = search.found[key].beside.log_evidence, model.u
         if known is not None:
             best = refitted(search.rival(key), model, search.units, known)
-        u = drawn(best, found.covariance(key))
+        u, spread = drawn(best, found.covariance(key)), spread_of(found, key, use)
     else:
         at = states.mixture(key, use)
         log_z = at.log_evidence
@@ -163,7 +163,38 @@ def _linear(
     if found.is_missed and use is None:
         u = drawn(model.u, found.shown(key))
     evidence = models.record(rival, sample, u, square, best)
-    return Fit(rival, sample, evidence, best, mode, linear, known)
+    return Fit(rival, sample, evidence, best, mode, linear, known, spread)
+
+
+def spread_of(
+    found: Verdict,
+    key: ModelKey,
+    use: NDArray[np.bool_] | None = None,
+    *,
+    # Mean squared error, in sensor variances, that counts as none.
+    tiny: float = 1e-9,
+) -> Spread:
+    """Return the errors of a model's predictions by those on left-out parts.
+
+    Args:
+        found: The models, where every one misses.
+        key: Key of the model that predicts.
+        use: Parts of the trials that count, shape (f,); None takes all.
+        tiny: Mean squared residual, in sensor variances, that a channel has at least.
+    """
+    search, errors = found.search, found.search.errors
+    own, m, fold = search.found[key], errors.measurements, errors.fold
+    rows = own.model.scale[:, None] * own.model.rows[: own.model.num]  # of the sensor
+    residual = np.maximum(m.by_channel(rows[:, 0] ** 2), tiny)[m.channel]
+    known = ((rows[:, 1:] @ found.covariance(key)) * rows[:, 1:]).sum(1)
+    told = np.isfinite(own.left.square) & (True if use is None else use)
+    kept = errors.is_scored & told[fold]
+    each = own.left.error[kept] ** 2 / (residual + known)[kept]
+    total = np.bincount(fold[kept], each, len(told))[told]
+    square = m.by_channel((search.unit * rows[:, 0]) ** 2)
+    square = np.maximum(square, tiny * m.by_channel(search.unit**2))
+    count = np.bincount(fold[kept], minlength=len(told))[told]
+    return Spread(np.sqrt(square), total / count)
 
 
 def _residual(unit: Array, model: LinearModel, u: Array) -> Array:

@@ -93,7 +93,7 @@ def shared_process(
     log_p = np.concatenate([log_det - np.log(len(log_det)) for log_det in logs])
     use = np.ones(num, bool)
     gram = np.concatenate(grams) + errors.unchanged(model.rows, use)
-    found = summed(gram, log_p, model)
+    found = summed(gram, log_p, model, WIDTHS if model.key.effects else (1.0,))
     return found.mean, found.cov
 
 

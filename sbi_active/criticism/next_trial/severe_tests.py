@@ -89,9 +89,8 @@ def _most_severe(
 
 def _difference(verdict: Prediction, free: Prediction, num: int) -> Array:
     """Return d of each trial, shape (num,)."""
-    mean, sd = verdict.moments()
-    other, spread = free.moments()
-    square = ((other - mean) ** 2 + spread**2) / sd**2
+    (_, sd), (_, spread) = verdict.moments(), free.moments()
+    square = ((free.middle - verdict.middle) ** 2 + spread**2) / sd**2
     trial = verdict.measurements.trial
     total = np.bincount(trial, square, minlength=num)
     size = np.bincount(trial, minlength=num)

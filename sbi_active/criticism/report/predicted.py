@@ -24,6 +24,7 @@ class Registered:
         limit: Distance within which an outcome lies with a probability of .9, root mean
             square over x in ``sd``.
         bare: Numbers that the bare model predicts, shape (N,), in units of x.
+        effects: Effects of the model that predicts, named by the verdict or not.
     """
 
     index: float
@@ -35,6 +36,7 @@ class Registered:
     position: Array
     limit: float
     bare: Array
+    effects: tuple[str, ...] = ()
 
     def distance(self, x: Array) -> float:
         """Return the distance of an outcome; NaN if nothing was measured.

@@ -166,8 +166,17 @@ def predict(
     num_draws: int = NUM_DRAWS,
     seed: int | None = None,
     scored: bool = True,
+    near: float = 0.1,
 ) -> Prediction:
-    """Return the posterior predictive of a rival.
+    r"""Return the posterior predictive of a rival.
+
+    If every model misses, its draws are those of a linear model about the best fit
+    :math:`\hat u`, and its errors as large as those on left-out trials
+    (:class:`.Spread`). Where parameters make up for each other a simulator bends long
+    before draws end, so that it is asked near the fit alone:
+
+    .. math::
+        f(\hat u) + \frac{f(\hat u + a (u - \hat u)) - f(\hat u)}{a} .
 
     Args:
         rivals: The models; the rival is fitted to their trials.
@@ -179,16 +188,26 @@ def predict(
         num_draws: Number n of posterior draws.
         seed: Seed of the draws; None is that of the models.
         scored: Whether to compute ``log_likelihood``, which is empty without.
+        near: Share a of the distance of draws from a best fit at which the simulator is
+            asked: with 1 it bends, below .001 single precision shows.
     """
     fit = rivals.fit(key) if fit is None else fit
     rival, sample, key = fit.rival, fit.sample, fit.rival.key
     seed = rivals.seed if seed is None else seed
     rng = np.random.default_rng(derive_seed(seed, "predictive", str(key)))
-    u = sample.draws(num_draws, rng)
-    own_residual = rival.residual(u, penalized=False)[0]
-    if fit.known is not None:
-        own_residual = own_residual[:, fit.known]
-    u, own_residual = fit.weighed(u, own_residual, rng)
+    u, own_residual = sample.draws(num_draws, rng), None
+    errs = fit.spread
+    is_linear = errs is not None and (trials is None or not rivals.nuisances)
+    if is_linear:
+        jumps = not rivals.is_smooth or rivals.roughness.any()
+        near = 1.0 if jumps or rivals.simulator.is_stochastic else near
+        assert fit.best is not None
+        u = fit.best + near * np.concatenate([np.zeros((1, rival.dim)), u - fit.best])
+    elif errs is None:
+        own_residual = rival.residual(u, penalized=False)[0]
+        if fit.known is not None:
+            own_residual = own_residual[:, fit.known]
+        u, own_residual = fit.weighed(u, own_residual, rng)
     target = rivals.trials if trials is None else trials
     simulator = TrialSimulator(
         rivals.simulator.model, target, seed=derive_seed(rivals.seed, "predicted")
@@ -207,11 +226,15 @@ def predict(
     if trials is None and not simulator.is_stochastic:  # simulated already
         simulator = rivals.simulator
     mean, unit, probability = simulator.predict(theta, phi)
-    at_best = None
-    if trials is not None and fit.best is not None and not rivals.nuisances:
-        at_best = simulator.predict(*rival.coordinates.split(fit.best[None]))[0][0]
+    noise, at_best = rivals.noise_of(m), None
+    if is_linear:
+        at_best, mean = mean[0], mean[0] + (mean[1:] - mean[0]) / near
+        probability, unit = probability[1:], None
+        phi = {name: value[1:] for name, value in phi.items()}
         at_best = np.where(np.isfinite(at_best), at_best, mean.mean(0))
-    noise = rivals.noise_of(m)
+    if errs is not None:
+        middle = mean.mean(0) if at_best is None else at_best
+        mean = middle + errs.scale * (mean - middle)
     factor = simulator.noise_scale(phi, num_draws)
     factor = np.ones_like(mean) if factor is None else factor
     factor = factor if unit is None else factor * unit
@@ -222,7 +245,7 @@ def predict(
         wide = spread / noise.typical_sd
         mean, factor = np.where(missing, center, mean), np.where(missing, wide, factor)
     extra = np.zeros(len(m))
-    if isinstance(rival.error, ResidualProcess):
+    if isinstance(rival.error, ResidualProcess) and own_residual is not None:
         shift, extra = rival.error.condition(
             own_residual,
             m,
@@ -231,15 +254,23 @@ def predict(
             spread=spread,
         )
         mean = mean + shift
-    cells, sizes = fit.error.noise_posterior(own_residual, rng)
-    errors, sd = noise.errors(cells, sizes, rng)
-    errors, sd = errors * factor, np.sqrt((sd * factor) ** 2 + extra**2)
+    if errs is not None:
+        extra = errs.sizes[m.channel]
+        sd = np.zeros(mean.shape) if spread is None else np.where(missing, spread, 0.0)
+        errors = sd * rng.normal(size=mean.shape)
+    else:
+        assert own_residual is not None
+        cells, sizes = fit.error.noise_posterior(own_residual, rng)
+        errors, sd = noise.errors(cells, sizes, rng)
+        errors, sd = errors * factor, sd * factor
+    sd = np.sqrt(sd**2 + extra**2)
     errors = errors + extra * rng.normal(size=mean.shape)
     each = np.empty((num_draws, len(target) if scored else 0))
     for t in range(each.shape[1]):
         at = (m.trial == t) & ~drops
         residual = (m.x - mean)[:, at]
-        if extra[at].any():  # independent numbers, as beside the residual process
+        # Independent numbers, beside the residual process and where every model misses.
+        if errs is not None or extra[at].any():
             e, own = residual / sd[:, at], np.log(sd[:, at])
             each[:, t] = (-0.5 * e**2 - own - 0.5 * LOG_2PI).sum(1)
         else:
@@ -272,7 +303,7 @@ def find_residuals(
     """
     trials, m, noise = rivals.trials, rivals.measurements, rivals.model.noise
     prediction = predict(rivals, key=key)
-    mean, sd = prediction.moments()
+    mean, sd = prediction.middle, prediction.moments()[1]
     times = trials.sample_times
     times = rivals.model.sample_times if times is None else times
     kind = "stochastic"
@@ -280,7 +311,7 @@ def find_residuals(
         kind = "declared" if noise.posterior is None else "estimated"
     x, follows, correlation = trials.x.numpy(), np.isfinite(m.gap), 0.0
     if follows.any():  # the posterior mean of that of neighboring errors
-        weight = rivals.noise.posterior(m.x - prediction.mean.mean(0)).sum(1)
+        weight = rivals.noise.posterior(m.x - mean).sum(1)
         rho = [float(np.median(c.rho[follows])) for c in rivals.noise.cells]
         correlation = float(weight @ np.array(rho))
 

@@ -1,6 +1,7 @@
 """Trials that decide, on models whose truth is known."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -9,7 +10,7 @@ from sbi.utils import BoxUniform
 
 from sbi_active import DiscreteActions, GaussianNoise, SimulatorModel
 from sbi_active.criticism import Criticism, Trials, close_loop
-from sbi_active.criticism.experiments.choice import limit_of
+from sbi_active.criticism.experiments.choice import limit_of, unless_untested
 from sbi_active.criticism.experiments.settle import NAME, VerdictError, settle
 from tests.effects import added
 
@@ -149,6 +150,29 @@ def test_predictions_where_every_model_misses_are_as_wide_as_left_out_errors():
     # The process has a root mean square of .07; t of 8 trials widens its 90 % limit.
     assert sum(held) >= 3  # fewer of 5 at .9 have a probability of .009
     assert 0.07 < sum(sizes) / len(sizes) < 0.2
+
+
+def test_no_effect_is_named_that_predicted_no_trial():
+    action, x = wandering(9, 0)
+    x = x + 0.5
+    report = close_loop(
+        *(WAVE, BoxUniform(torch.tensor([0.5]), torch.tensor([2.5]))),
+        Trials(action[:8], x[:8], sample_times=TIMES),
+        effects=[added("bias", torch.ones_like)],
+        actions=DiscreteActions(action[8:]),
+        real_system=lambda action: x[8],
+        max_trials=1,
+        evaluate=False,
+    )
+    (trial,) = report.tested
+    assert report.tracing.misfit.named == trial.registered.effects == ("bias",)
+    assert unless_untested(report, [trial]) is report
+    others = replace(trial, registered=replace(trial.registered, effects=()))
+    found = unless_untested(report, [others])
+    assert (found.verdict, found.tracing.beside) == ("unexplained", ("bias",))
+    assert found.tracing.key == report.tracing.key  # it still predicts
+    assert found.warnings[-1].code == "SA533"
+    assert "unexplained" in str(found).splitlines()[0]
 
 
 @pytest.mark.parametrize(("most", "worth"), [(1, 1), (30, 1), (30, 30)])

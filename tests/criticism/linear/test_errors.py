@@ -1,6 +1,7 @@
 """The evidence under a residual process, against dense Gaussian integrals."""
 
 from dataclasses import replace
+from itertools import product
 
 import numpy as np
 import pytest
@@ -178,10 +179,10 @@ def test_an_error_that_trials_share_is_that_of_the_dense_integral(differs):
         each = len(kernels) * len(between) * len(errors.sizes[::2])
         for inside in kernels:
             for a in between:
-                for size in errors.sizes[::2]:
+                for size, width in product(errors.sizes[::2], WIDTHS):
                     k = inside * a[m.trial[:, None], m.trial]
                     noise = np.eye(len(m)) + size**2 * k
-                    prior = np.diag(model.sd**2)
+                    prior = np.diag(model.widened(width) ** 2)
                     design = rows[:, 1:]
                     whole = noise + design @ prior @ design.T
                     off = rows[:, 0] - design @ model.center
