@@ -87,7 +87,6 @@ class RivalSet:
         seed_of_trials = derive_seed(seed, "trials")
         self.simulator = TrialSimulator(augmented, trials, seed=seed_of_trials)
         self.measurements = self.simulator.measurements
-        self._factors: tuple[Array, Array] | None = None
         self._sizes: Sequence[Array] = ()
         self.noise = self.noise_of(self.measurements)
         self._predictives: dict[tuple[bytes | None, ...], tuple[Array, Array]] = {}
@@ -117,24 +116,10 @@ class RivalSet:
         new.fits = fits
         return new
 
-    def widened(self, largest: float) -> RivalSet:
-        """Return these models with errors that may be larger than declared.
-
-        Args:
-            largest: Largest value of their unknown factor, which is log-uniform from
-                one.
-        """
-        factors = np.geomspace(1.0, max(largest, 2.0), 14)
-        log_p = np.full(len(factors), -np.log(len(factors)))
-        return self._with_noise(_factors=(factors, log_p))
-
     def with_sizes(self, sizes: Sequence[Array]) -> RivalSet:
         """Return these models with errors of one of some sizes by channel, (c,)."""
-        return self._with_noise(_sizes=sizes)
-
-    def _with_noise(self, **own: Any) -> RivalSet:
         new = self.with_fits({})
-        vars(new).update(own)
+        new._sizes = sizes
         vars(new).pop("_process", None)  # which has that noise
         new.noise = new.noise_of(new.measurements)
         if new.roughness.any():
@@ -148,7 +133,7 @@ class RivalSet:
         if self._sizes:
             sizes = [np.maximum(size, 1e-300) for size in self._sizes]
             noise = noise.sized([size[measurements.channel] for size in sizes])
-        return noise if self._factors is None else noise.scaled(*self._factors)
+        return noise
 
     def rival(
         self, key: ModelKey, *, suspect: int | None = None, **further: Any

@@ -145,7 +145,7 @@ def _with_posteriors(found: Verdict, keys: Sequence[ModelKey]) -> RivalSet:
 
     The bare model's comes first: what nobody declared is sized by its residual.
     """
-    models, bare = found.models, ModelKey()
+    models, bare = found.rivals, ModelKey()
     models = models.with_fits({bare: posterior(found, models, bare)})
     fits = {key: posterior(found, models, key) for key in dict.fromkeys(keys)}
     return models.with_fits(fits)

@@ -19,7 +19,6 @@ from scipy.stats import chi2
 from sbi_active.arrays import Array
 from sbi_active.criticism.contradictions import OutlyingTrial
 from sbi_active.criticism.effects.effect import Effect
-from sbi_active.criticism.evidence.rival_set import RivalSet
 from sbi_active.criticism.forces.library import is_force
 from sbi_active.criticism.linear.left_out import Candidate, standard_errors
 from sbi_active.criticism.linear.model import LinearModel
@@ -223,18 +222,6 @@ class Verdict:
         several = len(self.choice.key.effects) > 1
         is_missed = scatters or several or own.error == UNEXPLAINED
         return self.search.sensor.is_known and is_missed
-
-    @cached_property
-    def models(self) -> RivalSet:
-        """The models, with the posteriors of those that are recorded.
-
-        Where every one misses, errors may be larger than declared.
-        """
-        rivals = self.rivals
-        measured = getattr(rivals.model.noise, "measurement_sd", None)
-        if self.is_missed and measured is None:
-            return rivals.widened(2 * self.model(ModelKey()).rms)
-        return rivals
 
     @cached_property
     def probabilities(self) -> dict[ModelKey, float]:

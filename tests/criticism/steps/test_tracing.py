@@ -201,7 +201,7 @@ def test_scores_before_and_after_are_those_of_the_normal_predictives(fitted):
 def test_each_trial_is_predicted_from_the_others():
     found = judged(rivals(X))
     own = Trials(ACTION, X)
-    made = evaluate_left_out(found, found.models, own, num_draws=2000)
+    made = evaluate_left_out(found, found.rivals, own, num_draws=2000)
     own = X[:, 0].double().numpy()
     for scores, names in ((made.before, ()), (made.after, ("curve",))):
         each = [predictive(X, names, np.arange(12) != t) for t in range(12)]
