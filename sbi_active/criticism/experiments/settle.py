@@ -23,7 +23,7 @@ from sbi_active.criticism.experiments.choice import (
     failures,
     is_settled,
     register,
-    unless_untested,
+    unless_unproven,
 )
 from sbi_active.criticism.report.predicted import Registered, TestedTrial
 from sbi_active.criticism.report.report import Report
@@ -120,7 +120,7 @@ def settle(
         report = criticism.report(designed=designed or bool(tested))
         if stopped == SETTLED and not is_settled(report, tested, settling):
             stopped = "left-out trials speak against the verdict"
-    report = unless_untested(report, tested)
+    report = unless_unproven(report, tested)
     warnings = (*report.warnings, *map(Message, failures(report, tested)))
     return replace(report, tested=(*tested,), stopped=stopped, warnings=warnings)
 

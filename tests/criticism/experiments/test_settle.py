@@ -10,7 +10,7 @@ from sbi.utils import BoxUniform
 
 from sbi_active import DiscreteActions, GaussianNoise, SimulatorModel
 from sbi_active.criticism import Criticism, Trials, close_loop
-from sbi_active.criticism.experiments.choice import limit_of, unless_untested
+from sbi_active.criticism.experiments.choice import limit_of, unless_unproven
 from sbi_active.criticism.experiments.settle import NAME, VerdictError, settle
 from tests.effects import added
 
@@ -152,7 +152,7 @@ def test_predictions_where_every_model_misses_are_as_wide_as_left_out_errors():
     assert 0.07 < sum(sizes) / len(sizes) < 0.2
 
 
-def test_no_effect_is_named_that_predicted_no_trial():
+def test_no_effect_is_named_whose_predictions_did_not_hold():
     action, x = wandering(9, 0)
     x = x + 0.5
     report = close_loop(
@@ -166,9 +166,13 @@ def test_no_effect_is_named_that_predicted_no_trial():
     )
     (trial,) = report.tested
     assert report.tracing.misfit.named == trial.registered.effects == ("bias",)
-    assert unless_untested(report, [trial]) is report
+    assert trial.held
+    assert unless_unproven(report, [trial]) is report
+    failed = replace(trial, registered=replace(trial.registered, limit=0.0))
+    assert unless_unproven(report, [failed, trial]) is report
+    assert unless_unproven(report, [failed, trial, failed]).verdict == "unexplained"
     others = replace(trial, registered=replace(trial.registered, effects=()))
-    found = unless_untested(report, [others])
+    found = unless_unproven(report, [others])
     assert (found.verdict, found.tracing.beside) == ("unexplained", ("bias",))
     assert found.tracing.key == report.tracing.key  # it still predicts
     assert found.warnings[-1].code == "SA533"
