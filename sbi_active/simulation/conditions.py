@@ -96,20 +96,5 @@ def copied(value: Any) -> Any:
 
 
 def as_arrays(value: Any) -> Any:
-    """Return keyword arguments with float64 arrays in place of tensors and numbers."""
-    return changed(value, lambda v: np.asarray(v, dtype=np.float64))
-
-
-def one_row(arrays: Mapping[str, Any], i: int) -> dict[str, Any]:
-    """Return the keyword arguments of a row, from those of all, as copies of its own.
-
-    Args:
-        arrays: Arrays from :func:`as_arrays`.
-        i: Index of the row.
-    """
-
-    def own(value: Any) -> Any:
-        is_number = isinstance(value, np.ndarray) and not value.ndim
-        return float(value) if is_number else value
-
-    return changed(copied(at_rows(arrays, i)), own)
+    """Return float64 arrays in place of tensors, and numbers as NumPy's."""
+    return changed(value, lambda v: np.asarray(v, dtype=np.float64)[()])

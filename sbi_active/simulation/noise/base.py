@@ -163,14 +163,8 @@ class ScaleNoise(NoiseModel):
             require(0 <= value < math.inf, expected, value, "correct it")
 
     def __repr__(self) -> str:
-        shared = {
-            name: value
-            for name, value in zip(
-                self.parameter_names, self.parameters.tolist(), strict=True
-            )
-            if not name.startswith("sd")
-        }
-        parts = {"sd": self.sd.tolist(), **shared}
+        named = [*zip(self.parameter_names, self.parameters.tolist(), strict=True)]
+        parts = {"sd": self.sd.tolist(), **dict(named[self._num_sd :])}
         text = ", ".join(f"{k}={v}" for k, v in parts.items())
         known = "" if self.posterior is None else ", with a posterior"
         return f"{type(self).__name__}({text}{known})"
