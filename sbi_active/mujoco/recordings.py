@@ -53,10 +53,11 @@ def trials_of(
     """Return logs as trials.
 
     Each log has a column "time", s from the start of the trial, one for each input and
-    one for each sensor, and may have "start hinge" or "start hinge velocity", of which
-    the first row counts. If a sensor has the name of an input, the input's column is
-    "hinge control". A sensor may have NaN where it was not read; an input is held. A
-    unit in brackets, as in "hinge [deg]" or "time [ms]", is converted.
+    one for each sensor, and may have "start hinge" or "start hinge velocity", the same
+    in each row. All logs have the same columns. If a sensor has the name of an input,
+    the input's column is "hinge control". A sensor may have NaN where it was not read,
+    and an input where the one before holds. A unit in brackets, as in "hinge [deg]" or
+    "time [ms]", is converted.
 
     Args:
         model: Compiled model.
@@ -67,8 +68,7 @@ def trials_of(
 
     Raises:
         ValueError: If a column is missing, not known or in a unit that cannot be
-            converted, the time does not increase, an input is NaN, or a control is
-            outside its range.
+            converted, the time does not increase, or a control is outside its range.
     """
     if isinstance(recordings, pd.DataFrame | Mapping | str | Path):
         recordings = [recordings]
@@ -158,7 +158,7 @@ def _columns(
         require(
             bool(is_known),
             f"{name!r} in {expected or 'a unit of SI'}",
-            f"[{told}]",
+            f"[{told}] in the recordings",
             "convert the numbers, or leave their unit out",
         )
     # From here on they are called as the model's own.

@@ -14,7 +14,7 @@ def logs(num=2):
     t = np.arange(0, 1, 0.01)
     return [
         pd.DataFrame(
-            {"time": t, "push": np.sin(5 * t + k), "position": k * t, "speed": 0 * t}
+            {"time": t, "push": np.sin(5 * t + k), "position": 0 * t, "speed": 0 * t}
         )
         for k in range(num)
     ]

@@ -295,7 +295,10 @@ def _require_distinct(cells: Cells, action: Array, samples: list[Array]) -> None
         has = np.isfinite(own[:, 1:])
         if not (has.any() if cells.is_long else has.all()):
             continue
-        one = seen.setdefault(np.append(action[t], own).tobytes(), t)
+        at = cells.members[t]
+        inputs = [cells.numbers(c, empty=True)[at] for c in cells.columns["input"]]
+        told = np.concatenate([action[t], own.ravel(), *inputs])
+        one = seen.setdefault(told.tobytes(), t)
         got = f"the same numbers in {'trials' if cells.is_long else 'rows'} "
         got += f"{cells.names[one]} and {cells.names[t]} of {cells.source}"
         require(one == t, "each trial once", got, AGAIN)
