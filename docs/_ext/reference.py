@@ -52,7 +52,7 @@ FURTHER = {
         "sbi_active.pyro.denoising": ("Denoised", "denoise"),
         "sbi_active.pyro.models": ("PyroProblem",),
     },
-    "simulation": {"sbi_active.simulation.report": ("SimulatorReport",)},
+    "simulation": {"sbi_active.simulation.check": ("SimulatorReport",)},
 }
 #: A shape such as (n, *x_shape), whose star is no emphasis; words in a row may be.
 STAR = re.compile(r"(?<![\\\w*`])\*(?=[a-z_]+\b(?!\*))(?![a-z]+( [a-z]+)+\*)")

@@ -10,7 +10,6 @@ import numpy as np
 import torch
 
 from sbi_active.arrays import Array
-from sbi_active.criticism.data.trials import Trials
 from sbi_active.criticism.effects.effect import Effect
 from sbi_active.criticism.identification import IdentifiedBelief, identify
 from sbi_active.expected import require, suggests
@@ -25,7 +24,6 @@ NUM_DRAWS = 10_000
 def identify_robot(
     robot: Robot,
     *,
-    trials: Trials | None = None,
     beside: Sequence[Effect] | None = None,
     seed: int = 0,
 ) -> IdentifiedBelief:
@@ -36,7 +34,6 @@ def identify_robot(
 
     Args:
         robot: Robot of :func:`.from_mjcf` or :func:`.from_sysid`.
-        trials: Trials in place of the robot's recordings.
         beside: Effects that may be there; None takes friction loss, quadratic damping
             and stiffness of each joint, and a lag of each drive.
         seed: Seed of all draws.
@@ -44,12 +41,13 @@ def identify_robot(
     Raises:
         ValueError: If there are no recordings.
     """
-    trials = robot.trials if trials is None else trials
-    advice = "pass trials=, or from_mjcf(recordings=...)"
-    require(trials is not None, "a robot with recordings", "none", advice)
-    assert trials is not None
-    beside = likely_effects(robot, trials) if beside is None else beside
-    return identify(robot.simulator, robot.prior, trials, beside=beside, seed=seed)
+    if robot.trials is None:
+        raise ValueError(
+            "expected a robot with recordings; got none; pass from_mjcf(recordings=...)"
+        )
+    beside = likely_effects(robot) if beside is None else beside
+    parts = robot.simulator, robot.prior, robot.trials
+    return identify(*parts, beside=beside, seed=seed)
 
 
 def belief_to_parameters(

@@ -77,12 +77,7 @@ class MotionLimits:
         num_draws: int = 8,
         seed: int = 0,
     ) -> None:
-        function = robot.simulator.fn
-        if not isinstance(function, MujocoFunction):
-            raise ValueError(
-                f"expected a robot that runs MuJoCo; got {type(function).__name__}; "
-                "pass what from_mjcf or from_sysid returned"
-            )
+        function: MujocoFunction = robot.simulator.fn  # pyright: ignore
         model = function.model
         if position is None:
             position = _ranges(model, "joint", model.jnt_limited, model.jnt_range)
@@ -108,12 +103,6 @@ class MotionLimits:
         self._times = _every_step(robot.simulator, model.opt.timestep)
         with forked_generators(seed):
             self._theta = (belief or robot.prior).sample((num_draws,)).double()
-
-    def __repr__(self) -> str:
-        rows = zip(self._labels, self._low, self._high, strict=True)
-        return (
-            f"MotionLimits({', '.join(f'{n} in [{a:g}, {b:g}]' for n, a, b in rows)})"
-        )
 
     def __call__(self, action: Tensor) -> Tensor:
         """Return a mask of actions (n, action_dim) within all limits, bool (n,)."""
@@ -193,7 +182,7 @@ def _with_sensors(simulator: SimulatorModel, edits: Sequence[Any]) -> SimulatorM
         for m in function.machines
     ]
     own = copy.copy(function)
-    own.machines, own.readout, own.times = tuple(machines), None, None
+    own.machines, own.readout = tuple(machines), None
     own.channels = channels_of(own.model, [edit.name for edit in edits])
     return SimulatorModel(own, inputs=simulator.inputs)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from itertools import chain
 from pathlib import Path
 from typing import Any
@@ -12,13 +13,22 @@ import pandas as pd
 
 from sbi_active.arrays import Array
 from sbi_active.criticism.data.cells import Cells, read_csv
-from sbi_active.criticism.data.columns import find_columns
-from sbi_active.criticism.data.tables import find_recordings
+from sbi_active.criticism.data.columns import TRIAL, Column, find_columns
+from sbi_active.criticism.data.tables import (
+    arguments_of,
+    find_recordings,
+    headers_of,
+)
 from sbi_active.criticism.data.trials import Trials
 from sbi_active.criticism.data.units import TIME, split, to_si
-from sbi_active.expected import did_you_mean, require
+from sbi_active.expected import require
 from sbi_active.messages import warn
-from sbi_active.mujoco.models.names import names_of, places_of, scalar_joints
+from sbi_active.mujoco.models.names import (
+    names_of,
+    places_of,
+    require_name,
+    scalar_joints,
+)
 from sbi_active.mujoco.simulator import Channel
 
 START = "start "
@@ -43,10 +53,11 @@ def trials_of(
     """Return logs as trials.
 
     Each log has a column "time", s from the start of the trial, one for each input and
-    one for each sensor, and may have "start hinge" or "start hinge velocity", of which
-    the first row counts. If a sensor has the name of an input, the input's column is
-    "hinge control". A sensor may have NaN where it was not read; an input is held. A
-    unit in brackets, as in "hinge [deg]" or "time [ms]", is converted.
+    one for each sensor, and may have "start hinge" or "start hinge velocity", the same
+    in each row. All logs have the same columns. If a sensor has the name of an input,
+    the input's column is "hinge control". A sensor may have NaN where it was not read,
+    and an input where the one before holds. A unit in brackets, as in "hinge [deg]" or
+    "time [ms]", is converted.
 
     Args:
         model: Compiled model.
@@ -57,8 +68,7 @@ def trials_of(
 
     Raises:
         ValueError: If a column is missing, not known or in a unit that cannot be
-            converted, the time does not increase, an input is NaN, or a control is
-            outside its range.
+            converted, the time does not increase, or a control is outside its range.
     """
     if isinstance(recordings, pd.DataFrame | Mapping | str | Path):
         recordings = [recordings]
@@ -67,44 +77,29 @@ def trials_of(
         is_folder = isinstance(given, str | Path) and Path(given).is_dir()
         logs += find_recordings(Path(given)) if is_folder else [given]
     require(bool(logs), "at least one recording", "none", "pass logs")
-    cells = [
-        _cells(model, f"recording {k}", log, channels, inputs)
-        for k, log in enumerate(logs)
-    ]
-    times, x, series = [], [], {name: [] for name in inputs}
-    starts = {column.name: [] for column in cells[0].columns["start"]}
-    step = float(model.opt.timestep)
-    for log in cells:
-        require_seconds(log.time, step, log.source)
-        _note_spacing(log.time, step, log.source)
-        times.append(log.time)
-        values = [log.numbers(column, empty=True) for column in log.columns["x"]]
-        for channel, column in zip(channels, values, strict=True):
-            _note_angles(model, channel, column, log.source)
-        x.append(values[0] if len(channels) == 1 else np.stack(values, 1))
-        for name, column in zip(inputs, log.columns["input"], strict=True):
-            series[name].append(log.numbers(column))
-            require_in_range(model, name, series[name][-1], log.source)
-        own = [column.name for column in log.columns["start"]]
-        got = f"{', '.join(own) or 'none'} in {log.source} beside "
-        got += f"{', '.join(starts) or 'none'} in {cells[0].source}"
-        expected = "the same start states in each recording"
-        require(own == [*starts], expected, got, "add them to each")
-        for column in log.columns["start"]:
-            first = float(log.numbers(column, empty=True)[0])
-            expected = f"{column.name} in the first row of {log.source}"
-            require(np.isfinite(first), expected, "an empty cell", "fill it in")
-            starts[column.name].append(first)
-    same = all(np.array_equal(time, times[0]) for time in times)
-    return Trials(
-        None,
-        x,
-        sample_times=times[0] if same else times,
-        inputs=series or None,
-        input_times=times if inputs else None,
-        start={name.removeprefix(START): own for name, own in starts.items()} or None,
-        channel_labels=[channel.label for channel in channels],
-    )
+    parts = {}
+    for k, log in enumerate(logs):
+        is_file = isinstance(log, str | Path)
+        what = f"recording {k} ({log})" if is_file else f"recording {k}"
+        frame = read_csv(Path(log)) if is_file else pd.DataFrame(log)
+        require(len(frame) > 0, f"samples in {what}", "no rows", "record some")
+        header = [str(name).strip() for name in frame]
+        parts[what] = frame.set_axis(header, axis=1).assign(**{TRIAL: str(k)})
+    columns = _columns(model, headers_of(parts), channels, inputs)
+    cells = Cells(parts, columns, "the recordings")
+    found, step = arguments_of(cells), float(model.opt.timestep)
+    numbers = [cells.numbers(column, empty=True) for column in columns["x"]]
+    for what, at in zip(parts, cells.members, strict=True):
+        require_seconds(cells.time[at], step, what)
+        _note_spacing(cells.time[at], step, what)
+        for channel, values in zip(channels, numbers, strict=True):
+            _note_angles(model, channel, values[at], what)
+    for column in columns["input"]:
+        values = cells.numbers(column, empty=True)
+        require_in_range(model, column.name, values, "the recordings")
+    times = found.pop("sample_times")
+    same = all(np.array_equal(each, times[0]) for each in times)
+    return Trials(**{**found, "names": None}, sample_times=times[0] if same else times)
 
 
 def require_in_range(model: Any, name: str, values: Array, what: str) -> None:
@@ -132,40 +127,30 @@ def require_in_range(model: Any, name: str, values: Array, what: str) -> None:
     )
 
 
-def _cells(
+def _columns(
     model: Any,
-    what: str,
-    given: Any,
+    headers: Sequence[str],
     channels: Sequence[Channel],
     inputs: Sequence[str],
-) -> Cells:
-    """Return the columns of a log that a model takes, in SI."""
-    if isinstance(given, str | Path):
-        what = f"{what} ({given})"
-        given = read_csv(Path(given))
-    frame = pd.DataFrame(given)
-    require(len(frame) > 0, f"samples in {what}", "no rows", "record some")
-    frame.columns = [str(c).strip() for c in frame.columns]
+) -> dict[str, list[Column]]:
+    """Return the columns of logs that a model takes."""
     units = {TIME: "s", **{channel.name: channel.unit for channel in channels}}
-    names, own = [channel.name for channel in channels], [split(c)[0] for c in frame]
+    names, own = [channel.name for channel in channels], [split(c)[0] for c in headers]
     starts = [START + name for name in places_of(model)]
     for name in own:
-        require(
-            not name.startswith(START) or name in starts,
-            f"start states of joints in {what}",
-            repr(name),
-            did_you_mean(name, starts, f"did you mean {starts[0]!r}?"),
-        )
+        if name.startswith(START):
+            require_name(name, starts, "start state")
     # A column that an input shares with a sensor is the sensor's.
     controls = {name: f"{name} control" for name in inputs}
     is_other = {name: name in names or controls[name] in own for name in inputs}
     columns = {
+        TRIAL: TRIAL,
         TIME: TIME,
         "x": names,
         "input": [controls[name] if is_other[name] else name for name in inputs],
         "start": [name for name in starts if name in own],
     }
-    found = find_columns([*frame.columns], columns=columns, source=what)
+    found = find_columns(headers, columns=columns, source="the recordings")
     for column in chain(*found.values()):
         name, told = split(column.header)
         expected = units.get(name, "")
@@ -173,10 +158,18 @@ def _cells(
         require(
             bool(is_known),
             f"{name!r} in {expected or 'a unit of SI'}",
-            f"[{told}] in {what}",
+            f"[{told}] in the recordings",
             "convert the numbers, or leave their unit out",
         )
-    return Cells({what: frame}, found, what)
+    # From here on they are called as the model's own.
+    each = zip(found["x"], channels, strict=True)
+    called = zip(found["input"], inputs, strict=True)
+    starting = ((c, c.name.removeprefix(START)) for c in found["start"])
+    return found | {
+        "x": [replace(c, name=own.name, unit=own.unit) for c, own in each],
+        "input": [replace(c, name=name) for c, name in called],
+        "start": [replace(c, name=name) for c, name in starting],
+    }
 
 
 def require_seconds(time: Array, step: float, what: str) -> None:
@@ -220,14 +213,12 @@ def _note_angles(model: Any, channel: Channel, x: Array, what: str) -> None:
     if channel.unit != "rad" or len(seen) < 2:
         return
     jumps = np.abs(np.diff(seen))
-    for turn, unit in ((2 * np.pi, "2 pi"), (360.0, "360")):
-        wraps = np.abs(jumps - turn) < 0.1 * turn
-        if wraps.any() and np.median(jumps) < 0.2 * turn:
-            warn(
-                f"SA205 {channel.name} in {what} jumps by about {unit} in "
-                f"{int(wraps.sum())} places, as an angle that wraps: pass "
-                "numpy.unwrap of it",
-            )
+    wraps = np.abs(jumps - 2 * np.pi) < 0.1 * 2 * np.pi
+    if wraps.any() and np.median(jumps) < 0.2 * 2 * np.pi:
+        warn(
+            f"SA205 {channel.name} in {what} jumps by about 2 pi in {int(wraps.sum())} "
+            "places, as an angle that wraps: pass numpy.unwrap of it",
+        )
     joint = scalar_joints(model).get(channel.name)
     if joint is not None:
         limit = float(np.abs(model.jnt_range[joint]).max())

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from sbi_active.actions import ActionSpace, MixedActions
 from sbi_active.actions.signals import SignalActions
+from sbi_active.arrays import Array
 from sbi_active.criticism.data.trials import Trials
 from sbi_active.expected import require, suggests
 from sbi_active.mujoco.models.machine import Machine
@@ -21,7 +22,6 @@ from sbi_active.mujoco.models.names import (
     names_of,
     places_of,
     require_name,
-    scalar_joints,
 )
 from sbi_active.mujoco.models.parameters import Bounded, bounded
 from sbi_active.mujoco.models.running import initial
@@ -29,7 +29,6 @@ from sbi_active.mujoco.models.spec import Source, mujoco
 from sbi_active.mujoco.recordings import require_in_range, require_seconds, trials_of
 from sbi_active.mujoco.sensors import added_sensors, channels_of
 from sbi_active.mujoco.simulator import MODEL, MujocoFunction
-from sbi_active.mujoco.typical import warn_of_idle
 from sbi_active.simulation import SimulatorModel
 from sbi_active.simulation.noise.base import NoiseModel
 
@@ -81,7 +80,6 @@ def from_mjcf(
     noise: NoiseModel | float | Tensor | Mapping[str, float] | None = None,
     start: Mapping[str, float] | str | None = None,
     recordings: Any = None,
-    threads: int = 1,
 ) -> Robot:
     r"""Return a robot from its MJCF, ready for ``Campaign`` and ``close_loop``.
 
@@ -97,7 +95,8 @@ def from_mjcf(
         inputs: Actuators that recordings drive, None for all; or a space of signals
             named by actuators. These signals are then the actions.
         sensors: Sensors of the MJCF that are read, None for all; also joints, as in
-            "hinge" or "hinge velocity", for which it has no sensor.
+            "hinge" or "hinge velocity", for which it has no sensor. None reads all
+            joints of an MJCF without sensors.
         actions: Actions that are chosen in each trial, beside a signal too: its names
             are joints (start positions), joints with ``" velocity"`` behind, actuators
             (a control that is held), or "model". A name that a joint and an actuator
@@ -112,8 +111,6 @@ def from_mjcf(
             mocap bodies ("target mocap[0]") by name, or the name of a keyframe, which
             gives all of these. None is the model's.
         recordings: Logs, one a trial, as in :func:`.trials_of`, or a folder of them.
-        threads: Number of threads of MuJoCo's rollout, in each process. Results do
-            not depend on it.
 
     Raises:
         ValueError: If the MJCF does not compile, a name does not exist (the nearest are
@@ -153,17 +150,11 @@ def from_mjcf(
     grid = None if times is None else np.asarray(times, dtype=np.float64)
     if grid is not None:
         require_seconds(grid, float(machine.model.opt.timestep), "times=")
-    function = MujocoFunction(
-        machines,
-        channels,
-        roles=roles,
-        times=grid,
-        start=_start(machine.model, start),
-        threads=threads,
-    )
+    begin = _start(machine.model, start)
+    function = MujocoFunction(machines, channels, roles=roles, start=begin)
     inputs = None if space is None else actions  # pyright: ignore[reportAssignmentType]
     errors = _noise(machine.model, channels, noise)
-    return robot_of(function, errors, inputs, actions, trials)
+    return robot_of(function, errors, inputs, actions, trials, grid)
 
 
 def robot_of(
@@ -172,6 +163,7 @@ def robot_of(
     inputs: Any,
     actions: ActionSpace | None,
     trials: Trials | None,
+    times: Array | None,
 ) -> Robot:
     """Return the robot of a function, a prior of its parameters beside it.
 
@@ -181,8 +173,9 @@ def robot_of(
         inputs: Space of signals that actions play; None for none.
         actions: Actions that the robot may take.
         trials: Recorded trials.
+        times: Times of the readings where trials do not say, shape (k,).
     """
-    parameters, times = function.machines[0].parameters, function.times
+    parameters = function.machines[0].parameters
     simulator = SimulatorModel(
         function,
         noise=noise,
@@ -191,13 +184,11 @@ def robot_of(
         sample_times=None if times is None else torch.from_numpy(times),
         inputs=inputs,
     )
-    prior = named_box(parameters)
-    warn_of_idle(simulator, prior, actions, trials)
-    return Robot(simulator, prior, actions, trials)
+    return Robot(simulator, named_box(parameters), actions, trials)
 
 
 def require_usable(machines: Sequence[Machine]) -> None:
-    """Raise if models differ in what trials say of them by name, or lack inertia."""
+    """Raise if models differ in what trials say of them by name."""
     for kind in ("joint", "actuator", "sensor"):
         first = names_of(machines[0].model, kind)
         for k, machine in enumerate(machines):
@@ -206,18 +197,14 @@ def require_usable(machines: Sequence[Machine]) -> None:
             require(
                 own == first, f"models with the same {kind}s", got, "name them alike"
             )
-    for machine in machines:
-        machine.require_inertia()
 
 
-def from_spec(spec_or_path: Any) -> SimulatorModel:
-    """Return the simulator of a model without parameters, by all its joints."""
-    source = Source(spec_or_path)
-    model = source.compile()
-    sensors = names_of(model, "sensor") or [*scalar_joints(model)]
-    machine = Machine(added_sensors(source, sensors), ())
-    channels = channels_of(machine.model, sensors)
-    return SimulatorModel(MujocoFunction([machine], channels))
+def from_spec(spec_or_path: Any) -> Robot:
+    """Return a model without parameters as a robot, read by all its joints."""
+    machine = Machine(added_sensors(Source(spec_or_path), None), ())
+    function = MujocoFunction([machine], channels_of(machine.model, None))
+    simulator = SimulatorModel(function)
+    return Robot(simulator, prior=None)  # pyright: ignore[reportArgumentType]
 
 
 def _inputs(model: Any, inputs: Any) -> tuple[SignalActions | None, list[str]]:

@@ -62,20 +62,14 @@ def added_sensors(source: Source, sensors: Sequence[str] | None) -> Source:
 
     Args:
         source: Source of the model.
-        sensors: Names; None for those that the model has.
+        sensors: Names; None for those that the model has, or else all its joints.
 
     Raises:
-        ValueError: If there is neither a sensor nor a joint of a name, or none at all.
+        ValueError: If there is neither a sensor nor a joint of a name.
     """
     model = source.compile()
     own, joints = names_of(model, "sensor"), scalar_joints(model)
-    if sensors is None and own:
-        return source
-    if not sensors or isinstance(sensors, str):
-        raise ValueError(
-            f"expected a list of sensors, or some in the MJCF; got {sensors!r}; pass "
-            f"sensors=['hinge'], say, of its joints {', '.join(map(repr, joints))}"
-        )
+    sensors = own or [*joints] if sensors is None else sensors
     known = [*own, *joints, *[j + VELOCITY for j in joints]]
     edits = []
     for name in sensors:

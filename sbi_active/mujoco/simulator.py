@@ -13,7 +13,6 @@ from torch import Tensor
 
 from sbi_active.arrays import Array
 from sbi_active.expected import require
-from sbi_active.mujoco.models.changes import require_changes
 from sbi_active.mujoco.models.machine import Machine, Rows
 from sbi_active.mujoco.models.names import meaning, names_of, places_of, require_name
 from sbi_active.mujoco.models.running import Run, num_steps, sampled
@@ -63,11 +62,9 @@ class MujocoFunction:
         machines: Models of one set of parameters.
         channels: Channels that are returned.
         roles: Meaning of each entry of an action; "" for one that only names a trial.
-        times: Times of the readings where trials do not say, shape (k,).
         start: Start states of all trials that do not say, by name: positions,
             velocities, controls that are held ("motor control"), poses of mocap bodies
             ("target mocap[0]" to "target mocap[6]").
-        threads: Number of threads of MuJoCo's rollout.
         readout: Readout between the model's sensors and what is returned, with
             ``readout.late(theta)``, by how much each channel reads what was there
             before, s, and ``readout.read(x, theta)``, shapes (n, c) and (n, k, c).
@@ -85,19 +82,13 @@ class MujocoFunction:
         channels: Sequence[Channel],
         *,
         roles: Sequence[str] = (),
-        times: Array | None = None,
         start: Mapping[str, float] | None = None,
-        threads: int = 1,
         readout: Any = None,
         recorded: Mapping[str, Array] | None = None,
     ) -> None:
         self.readout, self.recorded = readout, dict(recorded or {})
         self.machines, self.channels = tuple(machines), tuple(channels)
-        self.roles, self.threads = tuple(roles), threads
-        self.times, self.start = times, dict(start or {})
-        is_number = isinstance(threads, int) and threads >= 1
-        got = f"threads={threads!r}"
-        require(is_number, "at least one thread", got, "pass 1 or more")
+        self.roles, self.start = tuple(roles), dict(start or {})
 
     @property
     def model(self) -> Any:
@@ -116,9 +107,9 @@ class MujocoFunction:
         theta: Tensor,
         action: Tensor,
         *,
+        times: Tensor,
         inputs: Mapping[str, Tensor] | None = None,
         input_times: Tensor | None = None,
-        times: Tensor | None = None,
         start: Any = None,
         model: Any = None,
         force: Any = None,
@@ -129,10 +120,10 @@ class MujocoFunction:
         Args:
             theta: Parameters, shape (n, d).
             action: Actions, shape (n, action_dim).
+            times: Times of the readings, shape (n, k).
             inputs: Controls by actuator, shape (n, m), held between their times.
             input_times: Times of the inputs, shape (m,); the simulation starts at the
                 first.
-            times: Times of the readings, shape (n, k).
             start: Start state by name of a joint, or with " velocity", shape (n,).
             model: Changes of the model, {:class:`.ModelChange`: (n, k)}.
             force: Generalized forces, {:class:`.Force`: (n, k)}.
@@ -145,18 +136,16 @@ class MujocoFunction:
         num = len(theta)
         starts = self._starts(start, _array(action), num)
         which = np.rint(starts.pop(MODEL, np.zeros(num))).astype(int)
-        last = len(self.machines) - 1
-        if num:
-            got = f"{which.min()} to {which.max()}"
-            is_known = bool((which >= 0).all() and (which <= last).all())
-            require(is_known, f"models 0 to {last}", got, "correct the action")
+        known = [*range(len(self.machines))]
+        is_known, got = bool(np.isin(which, known).all()), np.unique(which)
+        require(is_known, f"models among {known}", got, "correct the action")
         rows = Rows(
             _array(theta),
-            require_changes("model", model),
-            require_changes("force", force),
+            _numbers(model),
+            _numbers(force),
             starts,
-            {name: _array(series) for name, series in (inputs or {}).items()},
-            self._times(times, num),
+            _numbers(inputs),
+            _array(times),
         )
         grid = None if input_times is None else _array(input_times)
         x = np.zeros((*rows.times.shape, len(self.channels)))
@@ -188,21 +177,11 @@ class MujocoFunction:
             if watch is not None:
                 watch(run)
             late = None if self.readout is None else self.readout.late(some.theta)
-            read = run.readings(threads=self.threads)[..., channels]
+            read = run.readings()[..., channels]
             read = sampled(read, some.times, start, step, late)
             if self.readout is not None:
                 read = self.readout.read(read, some.theta)
             x[own[places]] += share[:, None, None] * read
-
-    def _times(self, times: Tensor | None, num: int) -> Array:
-        if times is not None:
-            return _array(times)
-        if self.times is None:
-            raise ValueError(
-                "expected the times at which sensors are read; got none; pass times= "
-                "to from_mjcf, or Trials(sample_times=...)"
-            )
-        return np.broadcast_to(self.times, (num, len(self.times)))
 
     def _starts(self, start: Any, actions: Array, num: int) -> dict[str, Array]:
         known = [*places_of(self.model), MODEL]
@@ -216,9 +195,6 @@ class MujocoFunction:
                 found[name] = value
         if start is None:
             return found
-        expected = "start states by the names of joints"
-        advice = "pass Trials(start={'hinge': angles})"
-        require(isinstance(start, Mapping), expected, "an array", advice)
         for name, value in start.items():
             require_name(name, known, "joint, or one with ' velocity',")
             found[name] = _array(value)
@@ -243,6 +219,10 @@ def _alike(
         is_few = len(lasting) * fewest > len(mine)
         for length in [None] if is_few else lasting:
             yield int(k), mine if length is None else mine[last[mine] == length]
+
+
+def _numbers(given: Mapping[Any, Tensor] | None) -> dict[Any, Array]:
+    return {key: _array(value) for key, value in (given or {}).items()}
 
 
 def _array(value: Tensor) -> Array:

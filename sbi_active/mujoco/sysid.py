@@ -24,9 +24,9 @@ from sbi_active.criticism.data.trials import Trials
 from sbi_active.expected import require, suggests
 from sbi_active.mujoco.models.machine import Machine
 from sbi_active.mujoco.models.names import names_of, scalar_joints, start_places
+from sbi_active.mujoco.models.parameters import Bounded
 from sbi_active.mujoco.models.spec import Source
 from sbi_active.mujoco.recordings import require_in_range
-from sbi_active.mujoco.residuals import free_parameters, from_residuals
 from sbi_active.mujoco.robot import Robot, require_usable, robot_of
 from sbi_active.mujoco.sensors import AddedSensor, channels_of
 from sbi_active.mujoco.simulator import MODEL, RECORDING, Channel, MujocoFunction
@@ -49,7 +49,6 @@ def from_sysid(
     transform: Any = None,
     actions: ActionSpace | None = None,
     noise: NoiseModel | float | Tensor | None = None,
-    threads: int = 1,
 ) -> Robot:
     r"""Return a robot from the data and parameters of ``mujoco.sysid``.
 
@@ -57,9 +56,7 @@ def from_sysid(
     Parameters keep the order of ``params.as_vector()``, and frozen ones their value.
 
     Args:
-        model_sequences: One ``ModelSequences`` or several; or a ``residual_fn`` of
-            ``build_residual_fn``, which is taken as a simulator as it is: an outcome is
-            then minus its residual, whose measured value is 0.
+        model_sequences: One ``ModelSequences``, or several.
         params: A ``ParameterDict``; the prior is uniform within its ``get_bounds()``.
         transform: A ``SignalTransform``. Its weights and normalization are not needed
             if noise is declared.
@@ -67,19 +64,16 @@ def from_sysid(
             which the action is the number. Entries are those of
             :class:`.MujocoFunction`; "model" is the number of a ``ModelSequences``.
         noise: Noise of the signals, one or one a signal; None takes autocorrelated
-            errors of unknown size, one a signal, and unknown correlation time. A
-            ``residual_fn`` needs it.
-        threads: Threads of MuJoCo's rollout.
+            errors of unknown size, one a signal, and unknown correlation time.
 
     Raises:
         ValueError: If signals differ between sequences, a signal is not one of the
             model, a control or a measured signal is not finite, or a control is outside
             its range.
     """
-    if callable(model_sequences):
-        return from_residuals(model_sequences, params, noise=noise)
-    groups = _groups(model_sequences)
-    edit, declared, signals = _Edit(params), free_parameters(params), _signals(groups)
+    is_several = isinstance(model_sequences, Sequence)
+    groups = [*model_sequences] if is_several else [model_sequences]
+    edit, declared, signals = _Edit(params), _free(params), _signals(groups)
     machines, channels = [], ()
     for group in groups:
         source, channels = _readable(Source(group.spec), signals)
@@ -101,14 +95,22 @@ def from_sysid(
         machines,
         channels,
         roles=(RECORDING,) if actions is None else tuple(actions.names),
-        times=times.numpy() if times.ndim == 1 else None,
-        threads=threads,
         readout=readout,
         recorded={name: value.numpy() for name, value in start.items()},
     )
     noise = _noise(trials) if noise is None else noise
     inputs = space if isinstance(space, SignalActions) else None
-    return robot_of(function, noise, inputs, space, trials)
+    grid = times.numpy() if times.ndim == 1 else None
+    return robot_of(function, noise, inputs, space, trials, grid)
+
+
+def _free(params: Any) -> tuple[Bounded, ...]:
+    """Return names and bounds of the parameters of a ``ParameterDict`` not frozen."""
+    names = params.get_non_frozen_parameter_names()
+    advice = "free the unknown ones"
+    require(bool(names), "a parameter that is not frozen", "none", advice)
+    each = zip(names, *params.get_bounds(), strict=True)
+    return tuple(Bounded(name, float(low), float(high)) for name, low, high in each)
 
 
 class _Edit:
@@ -134,17 +136,6 @@ class _Edit:
             parameter.update_from_vector(np.asarray(theta)[first:last])
             parameter.apply_modifier(spec)
             first = last
-
-
-def _groups(given: Any) -> list[Any]:
-    groups = list(given) if isinstance(given, Sequence) else [given]
-    parts = "spec", "control", "sensordata", "initial_state"
-    if not groups or not all(hasattr(g, part) for g in groups for part in parts):
-        raise TypeError(
-            f"expected ModelSequences of mujoco.sysid; got {given!r:.80}; pass one or "
-            "a list"
-        )
-    return groups
 
 
 def _signals(groups: Sequence[Any]) -> list[Signal]:
@@ -179,7 +170,7 @@ def _readable(
     for signal in signals:
         kind, name = signal.kind, signal.name
         expected, got = "sensors, positions or velocities", f"{name!r} of type {kind}"
-        advice = "pass a residual_fn, which knows what it is"
+        advice = "leave it out, or give its sensor"
         require(kind in ("MjSensor", *STATES), expected, got, advice)
         reads.append(name)
         if kind in STATES:
@@ -273,11 +264,9 @@ def _inside(
     end = begin + length
     slack = 1e-9 * max(abs(end), step)
     inside = (times >= begin + step - low - slack) & (times <= end - high + slack)
-    if not inside.any():
-        raise ValueError(
-            f"expected signals measured while the controls of {what} act, {begin:g} to "
-            f"{end:g}; got none; give both in one unit"
-        )
+    expected = f"signals measured while the controls of {what} act"
+    got = f"none from {begin:g} to {end:g}"
+    require(bool(inside.any()), expected, got, "give both in one unit")
     return inside
 
 

@@ -1,4 +1,4 @@
-"""A few typical rows of a robot: their sizes, and what changes nothing in them."""
+"""A few typical rows of a robot, and the sizes of what moves in them."""
 
 from __future__ import annotations
 
@@ -7,12 +7,9 @@ from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor
 
-from sbi_active.actions import ActionSpace
 from sbi_active.arrays import Array
 from sbi_active.criticism.data.trials import Trials
-from sbi_active.messages import warn
 from sbi_active.mujoco.models.names import scalar_joints
 from sbi_active.mujoco.models.running import Run
 from sbi_active.mujoco.models.spec import mujoco
@@ -62,11 +59,12 @@ def typical_call(
             call["input_times"] = simulator.inputs.input_times
     else:
         call |= _released(machine.model)
-    num = len(call["action"])
-    if "times" not in call and function.times is None:
-        grid = torch.linspace(0, SECONDS, 51, dtype=torch.float64)
-        call["times"] = grid.expand(num, -1)
-    return {"theta": middle.expand(num, -1), **call}
+    if "times" not in call:
+        grid = simulator.sample_times
+        if grid is None:
+            grid = torch.linspace(0, SECONDS, 51, dtype=torch.float64)
+        call["times"] = grid.expand(len(call["action"]), -1)
+    return {"theta": middle.expand(len(call["action"]), -1), **call}
 
 
 def _released(model: Any) -> dict[str, Any]:
@@ -77,50 +75,6 @@ def _released(model: Any) -> dict[str, Any]:
         rest = model.qpos0[model.jnt_qposadr[joint]]
         start[name] = torch.from_numpy(rest + SPREAD * rng.uniform(-1, 1, NUM_ROWS))
     return {"action": torch.zeros(NUM_ROWS, 1, dtype=torch.float64), "start": start}
-
-
-def warn_of_idle(
-    simulator: SimulatorModel,
-    prior: Any,
-    actions: ActionSpace | None,
-    trials: Trials | None,
-) -> None:
-    """Warn of parameters that change nothing from one bound to the other.
-
-    They are tried one by one at the middle of all others, in a few recorded trials, or
-    actions if there are none. Nothing is tried if neither says how a trial is run.
-
-    Args:
-        simulator: Simulator of a :class:`.MujocoFunction`.
-        prior: Prior, a box.
-        actions: Permitted actions.
-        trials: Recorded trials.
-    """
-    if trials is None and (actions is None or simulator.sample_times is None):
-        return
-    call = typical_call(simulator, trials, actions)
-    middle = call.pop("theta")
-
-    def x(k: int, value: Tensor) -> Tensor:
-        theta = middle.clone()
-        theta[:, k] = value
-        return simulator.fn(theta, **call)
-
-    idle = []
-    ends = zip(prior.base_dist.low, prior.base_dist.high, strict=True)
-    names = simulator.parameter_names or ()
-    for k, (name, (low, high)) in enumerate(zip(names, ends, strict=True)):
-        first, last = x(k, low), x(k, high)
-        if bool(((first == last) | (first.isnan() & last.isnan())).all()):
-            idle.append(name)
-    if idle:
-        where = "the recorded trials" if trials is not None else "permitted actions"
-        warn(
-            f"SA303 {', '.join(idle)} change nothing that is read in {len(middle)} of "
-            f"{where}: no such trial tells of them; leave them out, or read another "
-            "sensor",
-            stacklevel=5,
-        )
 
 
 #: States that are looked at in each row.
@@ -192,9 +146,7 @@ def nominal(
     low, high = np.percentile(together["q"], [5, 95], axis=0)
     parts = [_rms(together[k]) ** 2 for k in ("bias", "actuator", "passive")]
     readings = x.double().reshape(len(x), x.shape[1], -1).numpy()
-    times = call.get("times")
-    own = function.times if times is None else times[0].numpy()
-    assert own is not None
+    times = call["times"][0].numpy()
     return (
         Nominal(
             model,
@@ -207,7 +159,7 @@ def nominal(
             actuator_force=_positive(_rms(together["force"]), 1.0),
             actuator_velocity=_positive(_rms(together["speed"]), 1.0),
             reading=_positive(np.nanstd(readings, (0, 1)), 1.0),
-            times=own[np.isfinite(own)],
+            times=times[np.isfinite(times)],
             has_contacts=bool(together["contacts"].any()),
         ),
         call,
@@ -227,8 +179,11 @@ def _watched(run: Run) -> dict[str, Array]:
             mujoco.mj_step(own, data)
             if k % every or data.warning.number.any():
                 continue
+            # From that of the model, whatever joints there are.
+            away = np.zeros(own.nv)
+            mujoco.mj_differentiatePos(own, away, 1.0, own.qpos0, data.qpos)
             state = {
-                "q": _scalars(own, data),
+                "q": away,
                 "v": data.qvel,
                 "bias": data.qfrc_bias,
                 "actuator": data.qfrc_actuator,
@@ -241,13 +196,6 @@ def _watched(run: Run) -> dict[str, Array]:
             for name, value in state.items():
                 found.setdefault(name, []).append(np.array(value, dtype=float))
     return {name: np.stack(each) for name, each in found.items()}
-
-
-def _scalars(model: Any, data: Any) -> Array:
-    """Return the position of every degree of freedom, from that of the model."""
-    away = np.zeros(model.nv)
-    mujoco.mj_differentiatePos(model, away, 1.0, model.qpos0, data.qpos)
-    return away
 
 
 def _rms(value: Array) -> Array:

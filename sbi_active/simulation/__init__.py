@@ -55,7 +55,7 @@ __getattr__ = lazy_names(
         "ReusedRows": "sbi_active.simulation.reweighting:ReusedRows",
         "RowStore": "sbi_active.simulation.workers.store:RowStore",
         "Simulator": "sbi_active.simulation.simulator:Simulator",
-        "SimulatorReport": "sbi_active.simulation.report:SimulatorReport",
+        "SimulatorReport": "sbi_active.simulation.check:SimulatorReport",
         "require_noise": "sbi_active.simulation.simulator:require_noise",
         "unknown_noise": "sbi_active:AutocorrelatedNoise.unknown",
     },

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-import math
 import time
 import warnings
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from datetime import timedelta
 from typing import Any
 
 import torch
@@ -16,19 +17,55 @@ from sbi_active.actions import ActionSpace
 from sbi_active.actions.discrete import Actions, action_space
 from sbi_active.identifiability.sensitivities import ProbeSettings
 from sbi_active.identifiability.undetermined import Undetermined, find_undetermined
+from sbi_active.messages import Message
 from sbi_active.renamed import takes_loose
-from sbi_active.seeding import derive_seed, forked_generators, row_seeds
+from sbi_active.seeding import derive_seed, forked_generators
 from sbi_active.simulation.model import SimulatorModel, takes_seeds
-from sbi_active.simulation.outcomes import MissingRowsWarning, SimulationError
-from sbi_active.simulation.report import SimulatorReport
-from sbi_active.simulation.simulator import outcome_tensor, require_noise
+from sbi_active.simulation.outcomes import (
+    MissingRowsWarning,
+    SimulationError,
+    Simulations,
+)
+from sbi_active.simulation.simulator import require_noise
 from sbi_active.simulation.workers.engine import simulate
 from sbi_active.simulation.workers.settings import Workers
 
 MIN_ROWS = 16  # a choice: of the first runs, which are timed
-RUNS = 6  # of all rows, beside one a parameter and one an entry of the action
+RUNS = 12  # of all rows, beside three a parameter and one an entry of the action
 ROUNDING = 1e-5  # relative difference between batches that mixes no rows
 MANY = 0.5  # share of rows without a measurement that is worth a word
+
+
+@dataclass(frozen=True)
+class SimulatorReport:
+    """Findings about a simulator; ``print`` shows them.
+
+    Attributes:
+        facts: Shape of x, where random numbers come from, outcomes, and times.
+        warnings: Warnings of what deserves a look.
+        defects: Defects that keep a campaign from working.
+        undetermined: Parameters that no permitted action tells apart, as far as was
+            tried, and the combinations of them that actions do determine.
+    """
+
+    facts: tuple[str, ...]
+    warnings: tuple[Message, ...]
+    defects: tuple[Message, ...]
+    undetermined: tuple[Undetermined, ...] = ()
+
+    @property
+    def is_ready(self) -> bool:
+        """Whether nothing was found that keeps a campaign from working."""
+        return not self.defects
+
+    def __str__(self) -> str:
+        told = [f"warning: {text}" for text in self.warnings]
+        told += [f"defect: {text}" for text in self.defects]
+        return "\n".join(
+            [*self.facts, *told, "ready" if self.is_ready else "not ready"]
+        )
+
+    __repr__ = __str__
 
 
 @takes_loose(workers=Workers)
@@ -59,8 +96,7 @@ def check_simulator(
         num_rows: Rows a check, at least 16.
         max_seconds: Seconds of simulation time; a slow simulator gets fewer rows, 16 at
             least.
-        num_simulations: Simulations that the campaign needs, for
-            :attr:`SimulatorReport.minutes`.
+        num_simulations: Simulations that the campaign needs, to tell their time.
         workers: Workers of the campaign, or the number of calls at a time.
         seed: Seed of the draws.
 
@@ -71,31 +107,41 @@ def check_simulator(
         ...     lambda theta, action: theta[:, :1] * action,
         ...     BoxUniform(torch.zeros(2), torch.ones(2)), DiscreteActions([1.0, 2.0]),
         ... )
-        >>> report.is_ready, report.is_deterministic, report.idle_parameters
-        (False, True, ('theta_2',))
+        >>> report.is_ready, *report.warnings
+        (False, 'changing theta_2 leaves x as it is (SA303)')
     """
     check = _Check(simulator, prior, action_space(actions), seed)
-    check.found["num_simulations"] = num_simulations
-    check.found["num_workers"] = Workers.of(workers).num_workers
-    theta, action = check.draw(MIN_ROWS)
-    seconds = check.look(theta, action)
-    if not check.defects:
-        num_runs = RUNS + 3 * theta.shape[1] + action.shape[1] + RUNS
-        affordable = int(max_seconds / num_runs / (seconds / MIN_ROWS + 1e-9))
-        try:
-            check.compare(max(MIN_ROWS, min(num_rows, affordable)))
-        except SimulationError as error:
-            check.defects.append(_told(error))
-    return check.report()
+    try:
+        num_runs = RUNS + 3 * prior.event_shape[0] + check.actions.action_dim
+        affordable = int(max_seconds / num_runs / (check.look() + 1e-9))
+        seconds = check.compare(max(MIN_ROWS, min(num_rows, affordable)))
+        if num_simulations is not None:
+            num = Workers.of(workers).num_workers
+            took = timedelta(seconds=round(num_simulations * seconds / num))
+            check.facts.append(
+                f"campaign: at most {num_simulations:,} simulations, about {took} h on "
+                f"{num} worker{'s' * (num > 1)} for them, and some to learn"
+            )
+    except ValueError as error:
+        check.defects.append(str(error))
+    except SimulationError as error:  # its last line is its code
+        check.defects.append(str(error).splitlines()[-2])
+    return SimulatorReport(
+        (*check.facts,),
+        tuple(map(Message, check.warnings)),
+        tuple(map(Message, check.defects)),
+        check.undetermined,
+    )
 
 
 class _Check:
     """A look at a simulator, whose draws and runs share their seeds.
 
     Attributes:
-        found: Findings so far, by their names in the report.
-        defects: Defects so far.
+        facts: Facts so far.
         warnings: Warnings so far.
+        defects: Defects so far.
+        undetermined: Parameters that no action tells apart.
     """
 
     def __init__(
@@ -107,20 +153,16 @@ class _Check:
     ) -> None:
         self.simulator, self.prior = simulator, prior
         self.actions, self.seed = actions, seed
-        self.found: dict[str, Any] = {"takes_seeds": takes_seeds(simulator)}
-        self.defects: list[str] = []
+        self.facts: list[str] = []
         self.warnings: list[str] = []
-
-    def report(self) -> SimulatorReport:
-        """Return what was found."""
-        told: Any = {"defects": (*self.defects,), "warnings": (*self.warnings,)}
-        return SimulatorReport(**self.found, **told)
+        self.defects: list[str] = []
+        self.undetermined: tuple[Undetermined, ...] = ()
 
     def draw(self, num: int, key: str = "draw") -> tuple[Tensor, Tensor]:
         """Return parameters and actions; those of a discrete space equally often."""
         with forked_generators(self.seed, key, "theta"):
             theta = self.prior.sample((num,)).float()
-        values = getattr(self.actions, "values", None)
+        values = self.actions.listed()
         if values is None:
             seed = derive_seed(self.seed, key, "action")
             return theta, self.actions.sample((num,), seed=seed)
@@ -128,191 +170,170 @@ class _Check:
             order = torch.randperm(len(values))
         return theta, values[order[torch.arange(num) % len(values)]]
 
-    def call(self, theta: Tensor, action: Tensor, seeds: Tensor) -> Tensor:
-        """Call the simulator once; raises what it raises."""
-        is_model = isinstance(self.simulator, SimulatorModel)
-        takes = is_model or self.found["takes_seeds"]
-        given = {"seeds": seeds.clone()} if takes else {}
-        with forked_generators(self.seed, "call"):
-            x = self.simulator(theta.clone(), action.clone(), **given)
-        return outcome_tensor(x, len(theta))
-
-    def simulate(self, theta: Tensor, action: Tensor, key: str = "x") -> Any:
+    def simulate(
+        self, theta: Tensor, action: Tensor, key: str = "x", **how: Any
+    ) -> Simulations:
         """Return simulations, what raises being missing."""
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", MissingRowsWarning)
             seed = derive_seed(self.seed, key)
-            return simulate(self.simulator, theta, action, seed=seed)
+            return simulate(self.simulator, theta, action, seed=seed, **how)
 
-    def look(self, theta: Tensor, action: Tensor) -> float:
-        """Return seconds of several rows; one row must give x of the same shape.
-
-        Where a call raises, rows are simulated so that only those are lost that raise.
-        """
-        seeds, seconds = row_seeds(self.seed, len(theta)), math.nan
-        try:
-            self.call(theta, action, seeds)  # it may load
-            start = time.perf_counter()
-            x = self.call(theta, action, seeds)
-            seconds = time.perf_counter() - start
-            single = self.call(theta[:1], action[:1], seeds[:1])
-        except Exception as error:  # whatever the user's code raises is the finding
-            start = time.perf_counter()
-            try:
-                self.simulate(theta, action)
-            except (SimulationError, ValueError):
-                self.defects.append(_told(error))
-            return time.perf_counter() - start
+    def look(self) -> float:
+        """Return seconds a row of a few rows, of which one has the shape of several."""
+        theta, action = self.draw(MIN_ROWS)
+        x = self.simulate(theta, action).x  # it may load
+        start = time.perf_counter()
+        self.simulate(theta, action)
+        seconds = time.perf_counter() - start
+        single = self.simulate(theta[:1], action[:1]).x
         if single.shape[1:] != x.shape[1:]:
-            self.defects.append(
+            raise ValueError(
                 f"expected x of one shape; got {tuple(x.shape[1:])} a row from "
                 f"{len(theta)} rows and {tuple(single.shape[1:])} from one; keep the "
                 "rows' axis for a single row"
             )
-        return seconds
+        return seconds / MIN_ROWS
 
-    def compare(self, num_rows: int) -> None:
-        """Run so many rows under the same and other seeds, parameters and actions."""
-        theta, action = self.draw(num_rows)
-        seeds = row_seeds(derive_seed(self.seed, "x"), num_rows)
+    def compare(self, num_rows: int) -> float:
+        """Run rows under the same and other seeds, parameters and actions.
+
+        Returns:
+            Seconds a row.
+        """
+        drawn = theta, action = self.draw(num_rows)
         start = time.perf_counter()
-        rows = self.simulate(theta, action)
+        rows = self.simulate(*drawn)
         seconds = time.perf_counter() - start
-        again, other = (self.simulate(theta, action, key) for key in ("x", "other"))
-        independent = None
-        if self.found["takes_seeds"] and rows.counts["missing"] == 0:
-            order = torch.arange(num_rows).flip(0)
-            x = self.call(theta, action, seeds)
-            permuted = self.call(theta[order], action[order], seeds[order])
-            independent = _close(permuted, x[order])
-        is_deterministic, noiseless = _silent(rows.x, other.x)
-        self.found |= {
-            "num_rows": num_rows,
-            "x_shape": (*rows.x.shape[1:],),
-            "seconds": seconds,
-            "counts": rows.counts,
-            "is_reproducible": _same(rows.x, again.x),
-            "is_deterministic": is_deterministic,
-            "noiseless": noiseless,
-            "rows_are_independent": independent,
-        }
-        if self.found["is_reproducible"]:
-            fresh, drawn = self.draw(num_rows, "fresh"), (theta, action)
-            names = getattr(self.simulator, "parameter_names", None)
-            names = names or [f"theta_{i + 1}" for i in range(theta.shape[1])]
-            idle = self._idle(names, rows.x, drawn, (fresh[0], None))
-            self.found["idle_parameters"] = idle
-            self.found["idle_actions"] = self._idle(
-                self.actions.names, rows.x, drawn, (None, fresh[1])
+        again, other = self.simulate(*drawn), self.simulate(*drawn, "other")
+        has_seeds = takes_seeds(self.simulator)
+        none = "no argument for them; one is set for each 256 rows"
+        counts = ", ".join(f"{n} {name}" for name, n in rows.counts.items())
+        self.facts += [
+            f"x: shape (n, {', '.join(map(str, rows.x.shape[1:]))})",
+            f"seeds: {'one a row' if has_seeds else none}",
+            f"rows: {counts}",
+            f"time: {1e3 * seconds:.3g} ms for {num_rows} rows",
+        ]
+        self._judge_outcomes(rows)
+        self._judge_noise(rows, other, *drawn)
+        parts = self.simulate(*drawn, batch_size=num_rows // 3)
+        if has_seeds and not _close(rows.x, parts.x):
+            self.defects.append(
+                "SA404 x depends on which rows are simulated together; let row i "
+                "depend on theta[i], action[i] and seeds[i] alone"
             )
-            self.found["undetermined"] = self._undetermined(names, idle, num_rows)
-        self._judge(theta, action, rows)
+        if _same(rows.x, again.x):
+            self._judge_arguments(rows.x, drawn)
+        else:
+            self.warnings.append(
+                "SA405 one seed gives two different x, so that no run can be repeated; "
+                "take seeds, or draw from torch's or NumPy's global generator"
+            )
+        return seconds / num_rows
+
+    def _judge_outcomes(self, rows: Simulations) -> None:
+        """Tell of rows without a measurement, and of those that raise."""
+        num, missing = len(rows), rows.counts["missing"]
+        lost = num - rows.counts["ok"]
+        if lost == num:
+            self.defects.append("SA401 no row has a measurement")
+        elif lost > MANY * num:
+            self.warnings.append(
+                f"SA401 {lost / num:.0%} of the rows have no measurement"
+            )
+        if missing:
+            first = next(iter(rows.tracebacks.values())).strip().splitlines()[-1]
+            self.warnings.append(
+                f"SA301 {missing} rows raise, the first {first}; their outcome is "
+                "missing; return NaN where the system gave no measurement"
+            )
+
+    def _judge_noise(
+        self, rows: Simulations, other: Simulations, theta: Tensor, action: Tensor
+    ) -> None:
+        """Tell of numbers without noise, and of noise that counts twice."""
+        x, again = rows.x.flatten(1), other.x.flatten(1)
+        both = x.isfinite() & again.isfinite()
+        silent = ((x == again) | ~both).all(0) & both.any(0)
+        if bool((silent == both.any(0)).all()):
+            try:
+                require_noise(rows.x, other.x)
+            except ValueError as error:
+                self.defects.append(str(error))
+        elif bool(silent.any()):
+            numbers = ", ".join(map(str, torch.nonzero(silent)[:, 0].tolist()))
+            self.warnings.append(
+                f"SA403 numbers {numbers} of x have no noise, and so no density; "
+                "declare the noise of every channel"
+            )
+        model = self.simulator
+        if isinstance(model, SimulatorModel) and model.noise is not None:
+            sound = rows.counts["missing"] == 0
+            if sound and not model.is_deterministic(theta, action):
+                self.warnings.append(
+                    "SA402 fn is random beside declared noise, which so counts twice; "
+                    "declare noise=None, or remove the random numbers from fn"
+                )
+
+    def _judge_arguments(self, x: Tensor, drawn: tuple[Tensor, Tensor]) -> None:
+        """Tell of parameters and entries of the action that change nothing."""
+        (theta, action), fresh = drawn, self.draw(len(x), "fresh")
+        names = getattr(self.simulator, "parameter_names", None)
+        names = names or [f"theta_{i + 1}" for i in range(theta.shape[1])]
+        idle = self._idle(names, x, drawn, (fresh[0], action))
+        others = self._idle(self.actions.names, x, drawn, (theta, fresh[1]))
+        if len(idle) == theta.shape[1]:
+            self.defects.append("SA303 no parameter changes x")
+        elif idle:
+            self.warnings.append(f"SA303 changing {', '.join(idle)} leaves x as it is")
+        if others:
+            text = f"SA303 changing {', '.join(others)} leaves x as it is"
+            self.warnings.append(text)
+        self.undetermined = self._undetermined(names, idle, x)
+        self.warnings += [f"SA406 {group}" for group in self.undetermined]
 
     def _idle(
         self,
         names: Sequence[str],
         x: Tensor,
         drawn: tuple[Tensor, Tensor],
-        fresh: tuple[Tensor | None, Tensor | None],
-    ) -> tuple[str, ...]:
-        """Return names of columns of theta or action that change nothing."""
+        fresh: tuple[Tensor, Tensor],
+    ) -> list[str]:
+        """Return names of columns, of what is drawn afresh, that change nothing."""
         idle = []
         for column, name in enumerate(names):
             changed = [part.clone() for part in drawn]
-            for part, other in zip(changed, fresh, strict=True):
-                if other is not None:
-                    part[:, column] = other[:, column]
+            for part, old, new in zip(changed, drawn, fresh, strict=True):
+                if new is not old:
+                    part[:, column] = new[:, column]
             if all(map(torch.equal, changed, drawn)):  # a single action
                 continue
             if _same(self.simulate(changed[0], changed[1]).x, x):
                 idle.append(name)
-        return tuple(idle)
+        return idle
 
     def _undetermined(
-        self, names: Sequence[str], idle: Sequence[str], num_rows: int
+        self, names: Sequence[str], idle: Sequence[str], x: Tensor
     ) -> tuple[Undetermined, ...]:
         """Return parameters that no action tells apart, beside those that are idle."""
-        actions, num = self.actions.listed(), None
-        if actions is None:
-            seed = derive_seed(self.seed, "undetermined")
-            actions = self.actions.sample((ProbeSettings().most_actions,), seed=seed)
-        else:
-            num = len(actions)
-            with forked_generators(self.seed, "undetermined"):
-                actions = actions[torch.randperm(num)]
-        fewest = max(num_rows // 4, 1)  # as many sets of parameters as actions
+        # As many sets of parameters as actions.
+        num = min(ProbeSettings().most_actions, max(len(x) // 4, 1))
+        listed = self.actions.listed()
         try:
             return find_undetermined(
                 lambda theta, action, key: self.simulate(theta, action, key).x,
                 self.prior,
-                actions[:fewest],
+                self.draw(num, "undetermined")[1].unique(dim=0),
                 names,
                 skip=[i for i, name in enumerate(names) if name in idle],
-                num_rows=num_rows,
-                num_numbers=math.prod(self.found["x_shape"] or (1,)),
-                num_permitted=num,
+                num_rows=len(x),
+                num_numbers=x[0].numel(),
+                num_permitted=None if listed is None else len(listed),
                 seed=self.seed,
             )
         except SimulationError:  # at parameters next to others that it could simulate
             return ()
-
-    def _judge(self, theta: Tensor, action: Tensor, rows: Any) -> None:
-        """Add defects and warnings."""
-        defects, notes, found = self.defects, self.warnings, self.report()
-        lost = len(theta) - found.counts["ok"]
-        if lost == len(theta):
-            defects.append("SA401 no row has a measurement")
-        elif lost > MANY * len(theta):
-            notes.append(
-                f"SA401 {lost / len(theta):.0%} of the rows have no measurement"
-            )
-        if found.counts["missing"]:
-            text = next(iter(rows.tracebacks.values()), "").strip().splitlines()
-            notes.append(
-                f"SA301 {found.counts['missing']} rows raise, the first "
-                f"{text[-1] if text else 'without a word'}; their outcome is missing; "
-                "return NaN where the system gave no measurement"
-            )
-        if found.is_deterministic:
-            try:
-                require_noise(rows.x, rows.x)
-            except ValueError as error:
-                defects.append(str(error))
-        model = self.simulator
-        declared = isinstance(model, SimulatorModel) and model.noise is not None
-        sound = found.counts["missing"] == 0
-        if declared and sound and not model.is_deterministic(theta, action):
-            notes.append(
-                "SA402 fn is random beside declared noise, which so counts twice; "
-                "declare noise=None, or remove the random numbers from fn"
-            )
-        if found.noiseless:
-            notes.append(
-                f"SA403 numbers {', '.join(map(str, found.noiseless))} of x have no "
-                "noise, and so no density; declare the noise of every channel"
-            )
-        if found.rows_are_independent is False:
-            defects.append(
-                "SA404 rows permuted with their seeds do not give permuted x; let row "
-                "i depend on theta[i], action[i] and seeds[i] alone"
-            )
-        if not found.is_reproducible:
-            notes.append(
-                "SA405 one seed gives two different x, so that no run can be repeated; "
-                "take seeds, or draw from torch's or NumPy's global generator"
-            )
-        if len(found.idle_parameters) == theta.shape[1]:
-            defects.append("SA303 no parameter changes x")
-        elif idle := ", ".join(found.idle_parameters):
-            notes.append(f"SA303 changing {idle} leaves x as it is")
-        if idle := ", ".join(found.idle_actions):
-            notes.append(f"SA303 changing {idle} leaves x as it is")
-        notes += [f"SA406 {group}" for group in found.undetermined]
-
-
-def _told(error: Exception) -> str:
-    text = str(error)
-    return text if text.startswith("expected ") else f"{type(error).__name__}: {text}"
 
 
 def _same(x: Tensor, other: Tensor) -> bool:
@@ -322,16 +343,6 @@ def _same(x: Tensor, other: Tensor) -> bool:
 def _close(x: Tensor, other: Tensor) -> bool:
     measured = x[x.isfinite()]
     scale = float(measured.std()) if len(measured) > 1 else 0.0
-    near = torch.isclose(x, other, rtol=ROUNDING, atol=ROUNDING * scale * 0.1)
-    return bool((near | (x == other) | (x.isnan() & other.isnan())).all())
-
-
-def _silent(x: Tensor, other: Tensor) -> tuple[bool, tuple[int, ...]]:
-    """Return whether two seeds give one x, and else the numbers that they leave."""
-    x, other = x.flatten(1), other.flatten(1)
-    both = x.isfinite() & other.isfinite()
-    known = both.any(0)
-    silent = ((x == other) | ~both).all(0) & known
-    if bool(known.any()) and bool((silent == known).all()):
-        return True, ()
-    return False, tuple(torch.nonzero(silent)[:, 0].tolist())
+    return torch.allclose(
+        x, other, rtol=ROUNDING, atol=ROUNDING * scale * 0.1, equal_nan=True
+    )

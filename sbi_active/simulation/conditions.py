@@ -8,7 +8,7 @@ grid; and ``start``, the measured start states, (n, d) or {name: (n,)}.
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
@@ -20,13 +20,6 @@ from sbi_active.actions.signals import SignalActions
 
 #: Names of these arguments.
 CONDITIONS = ("times", "inputs", "input_times", "start")
-#: What gives each of them.
-SOURCES = {
-    "times": "SimulatorModel(sample_times=...) or Trials(sample_times=...)",
-    "inputs": "Trials(inputs=...)",
-    "input_times": "Trials(inputs=..., input_times=...)",
-    "start": "Trials(start=...)",
-}
 
 
 def parameters_of(fn: Callable[..., Any]) -> list[inspect.Parameter]:
@@ -37,67 +30,12 @@ def parameters_of(fn: Callable[..., Any]) -> list[inspect.Parameter]:
         return []
 
 
-def keywords_of(fn: Callable[..., Any], num_rows: int) -> tuple[list[str], bool]:
-    """Return names of keyword arguments behind the positional ones, and if any go."""
-    parameters = parameters_of(fn)
-    kinds = inspect.Parameter
+def keywords_of(fn: Callable[..., Any], num_rows: int) -> list[str]:
+    """Return names of the keyword arguments behind so many positional ones."""
+    kinds, parameters = inspect.Parameter, parameters_of(fn)
     named = kinds.POSITIONAL_OR_KEYWORD, kinds.KEYWORD_ONLY
     positional = [p for p in parameters if p.kind != kinds.KEYWORD_ONLY][:num_rows]
-    names = [p.name for p in parameters if p.kind in named and p not in positional]
-    return names, any(p.kind == kinds.VAR_KEYWORD for p in parameters)
-
-
-def takes_rng(fn: Callable[..., Any]) -> bool:
-    """Return whether a function of one row takes a third argument, its generator."""
-    parameters = parameters_of(fn)
-    kinds = inspect.Parameter
-    if any(p.kind == kinds.VAR_POSITIONAL for p in parameters) or not parameters:
-        return True
-    behind = [p for p in parameters if p.kind < kinds.VAR_POSITIONAL][2:3]
-    return any(
-        p.name != "context" and not isinstance(p.default, int | float) for p in behind
-    )
-
-
-def conditions_of(
-    fn: Callable[..., Any], keywords: Sequence[str]
-) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Return the conditions that a function takes, and those that it requires.
-
-    A condition that a ``functools.partial`` binds does not count.
-
-    Args:
-        fn: The function.
-        keywords: Names of its keyword arguments.
-    """
-    bound = getattr(inspect.unwrap(fn), "keywords", {})
-    takes = tuple(c for c in CONDITIONS if c in keywords and c not in bound)
-    if not takes:
-        return (), ()
-    parameters = inspect.signature(fn).parameters
-    none = inspect.Parameter.empty
-    return takes, tuple(c for c in takes if parameters[c].default is none)
-
-
-def require_conditions(needed: tuple[str, ...], given: Mapping[str, Any]) -> None:
-    """Raise if a function lacks a condition that it requires."""
-    for name in needed:
-        if name not in given:
-            raise ValueError(
-                f"expected {name} for a simulator whose function requires it; got "
-                f"none; pass {SOURCES[name]}, or give the argument a default"
-            )
-
-
-def require_taken(
-    inputs: SignalActions | MixedActions | None, conditions: tuple[str, ...]
-) -> None:
-    """Raise if signals are given that a function does not take."""
-    if inputs is not None and "inputs" not in conditions:
-        raise ValueError(
-            "expected a function that takes the signals of its actions; got one "
-            "without an argument 'inputs'; write fn(theta, action, *, inputs)"
-        )
+    return [p.name for p in parameters if p.kind in named and p not in positional]
 
 
 def played(
@@ -117,18 +55,6 @@ def played(
         },
         "input_times": space.input_times.to(dtype),
     }
-
-
-def require_rows_each(name: str, value: Any, num: int) -> None:
-    """Raise if a keyword argument is neither a number nor one a row."""
-    if isinstance(value, Mapping):
-        for key, part in value.items():
-            require_rows_each(f"{name}[{key!r}]", part, num)
-    elif name != "input_times" and np.ndim(value) and len(value) != num:
-        raise ValueError(
-            f"expected {name} as a number or one a row, shape ({num}, ...); got "
-            f"{tuple(np.shape(value))}; repeat it for each row"
-        )
 
 
 def changed(value: Any, change: Callable[[Any], Any]) -> Any:
@@ -170,20 +96,5 @@ def copied(value: Any) -> Any:
 
 
 def as_arrays(value: Any) -> Any:
-    """Return keyword arguments with float64 arrays in place of tensors and numbers."""
-    return changed(value, lambda v: np.asarray(v, dtype=np.float64))
-
-
-def one_row(arrays: Mapping[str, Any], i: int) -> dict[str, Any]:
-    """Return the keyword arguments of a row, from those of all, as copies of its own.
-
-    Args:
-        arrays: Arrays from :func:`as_arrays`.
-        i: Index of the row.
-    """
-
-    def own(value: Any) -> Any:
-        is_number = isinstance(value, np.ndarray) and not value.ndim
-        return float(value) if is_number else value
-
-    return changed(copied(at_rows(arrays, i)), own)
+    """Return float64 arrays in place of tensors, and numbers as NumPy's."""
+    return changed(value, lambda v: np.asarray(v, dtype=np.float64)[()])

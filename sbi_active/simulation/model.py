@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import copy
+import inspect
 import os
 import threading
 import uuid
@@ -16,30 +18,20 @@ from torch import Tensor
 from sbi_active.actions.mixed import MixedActions
 from sbi_active.actions.signals import SignalActions
 from sbi_active.arrays import own_tensor
-from sbi_active.expected import Shown, suggests
+from sbi_active.expected import Shown, require, suggests
 from sbi_active.seeding import forked_generators, row_seeds
 from sbi_active.simulation.conditions import (
+    CONDITIONS,
     as_arrays,
     at_rows,
-    conditions_of,
     copied,
     keywords_of,
-    one_row,
     parameters_of,
     played,
-    require_conditions,
-    require_rows_each,
-    require_taken,
-    takes_rng,
 )
 from sbi_active.simulation.noise.base import NoiseModel
 from sbi_active.simulation.noise.gaussian import GaussianNoise
-from sbi_active.simulation.simulator import (
-    outcome_array,
-    outcome_tensor,
-    require_rows,
-    square_of,
-)
+from sbi_active.simulation.simulator import outcome_array, outcome_tensor, require_rows
 
 FEW = 8  # rows that show whether fn is random
 ROUNDING = 1e-6  # relative difference that makes no draw
@@ -65,8 +57,7 @@ class SimulatorModel(Shown):
         fn: ``fn(theta, action)``, shapes (n, theta_dim) and (n, action_dim), giving
             (n, *x_shape); it may accept ``seeds``, shape (n,). With ``batched=False``,
             ``fn(theta, action, rng)`` of one row: float64 NumPy arrays of shapes
-            (theta_dim,) and (action_dim,), and a NumPy generator from the row's seed,
-            which a ``fn`` without random numbers may leave out.
+            (theta_dim,) and (action_dim,), and a NumPy generator from the row's seed.
         noise: Noise added to the output of ``fn``; None if ``fn`` is itself the
             draw. A number is the standard deviation of Gaussian noise.
         batched: Whether ``fn`` takes all rows at once.
@@ -91,8 +82,7 @@ class SimulatorModel(Shown):
         fn_takes_seeds: Whether each row of ``fn`` is a function of its seed.
 
     Raises:
-        ValueError: If ``setup`` is given and ``fn`` takes no ``context``, or ``fn``
-            takes ``rng`` and all rows at once, or takes no inputs that are given.
+        ValueError: If ``fn`` takes no inputs that are given.
 
     Example:
         >>> from sbi_active.simulation import GaussianNoise
@@ -122,30 +112,25 @@ class SimulatorModel(Shown):
         self.sample_times = sample_times
         if noise is not None and not isinstance(noise, NoiseModel):
             noise = GaussianNoise(noise)
+        if noise is not None and sample_times is not None:
+            noise = noise.at(sample_times)
         self.noise = noise
-        if noise is not None and self.sample_times is not None:
-            self.noise = noise.at(self.sample_times)
-        self._takes_rng = not batched and takes_rng(fn)
-        keywords, self._takes_any = keywords_of(fn, 3 if self._takes_rng else 2)
-        self.fn_takes_seeds = self._takes_rng or (batched and "seeds" in keywords)
-        if batched and "rng" in keywords:
-            raise ValueError(
-                "expected fn(theta, action) of all rows; got fn with an argument "
-                "'rng'; pass batched=False with a fn(theta, action, rng) of one row"
-            )
-        self.conditions, self._needs = conditions_of(fn, keywords)
+        keywords = keywords_of(fn, 2 if batched else 3)
+        self.fn_takes_seeds = not batched or "seeds" in keywords
+        bound = getattr(inspect.unwrap(fn), "keywords", {})  # of a partial function
+        self.conditions = tuple(
+            name for name in CONDITIONS if name in keywords and name not in bound
+        )
         self.inputs = inputs
-        require_taken(inputs, self.conditions)
-        reserved = ("seeds", "context") if batched else ("context",)
-        self.effect_names = tuple(k for k in keywords if k not in reserved)
-        if setup is not None and "context" not in keywords and not self._takes_any:
-            raise ValueError(
-                "expected fn to take what setup returns; got a fn without an argument "
-                f"'context', only {keywords}; add it as a keyword argument"
-            )
+        require(
+            inputs is None or "inputs" in self.conditions,
+            "a function that takes the signals of its actions",
+            "one without an argument 'inputs'",
+            "write fn(theta, action, *, inputs)",
+        )
+        self.effect_names = tuple(k for k in keywords if k not in ("seeds", "context"))
         self._token = uuid.uuid4().hex
         self._is_deterministic: bool | None = None
-        self._square: int | None = None
 
     def __call__(
         self,
@@ -211,14 +196,10 @@ class SimulatorModel(Shown):
 
     def without_noise(self) -> SimulatorModel:
         """Return a model of ``fn`` alone, which has other worker processes."""
-        bare = SimulatorModel(
-            self.fn,
-            setup=self.setup,
-            batched=self.is_batched,
-            sample_times=self.sample_times if "times" in self.conditions else None,
-            inputs=self.inputs,
-        )
-        bare._is_deterministic = self._is_deterministic
+        bare = copy.copy(self)
+        bare.noise = bare.parameter_names = bare.channel_names = None
+        if "times" not in self.conditions:
+            bare.sample_times = None
         return bare
 
     def is_deterministic(self, theta: Tensor, action: Tensor, **effects: Any) -> bool:
@@ -240,29 +221,25 @@ class SimulatorModel(Shown):
         self, theta: Tensor, action: Tensor, effects: Mapping[str, Any]
     ) -> bool:
         """Compare two seeds; rows that raise have no say where others do not."""
+
+        def drawn(seed: int) -> Tensor:
+            with forked_generators(seed, "deterministic"):
+                return self._run(theta, action, row_seeds(seed, len(theta)), effects)
+
         try:
-            x, again = (self._few(theta, action, effects, seed) for seed in (0, 1))
+            return torch.allclose(drawn(0), drawn(1), ROUNDING, 0.0, equal_nan=True)
         except Exception:
             if len(theta) == 1:
                 raise
             answers = []
             for i in range(len(theta)):
                 row = slice(i, i + 1)
-                own = at_rows(effects, row)
                 with suppress(Exception):
+                    own = at_rows(effects, row)
                     answers.append(self._agrees(theta[row], action[row], own))
             if not answers:
                 raise
             return all(answers)
-        scale = torch.maximum(x.abs(), again.abs())
-        same = ((x - again).abs() <= ROUNDING * scale) | (x == again)
-        return bool((same | (x.isnan() & again.isnan())).all())
-
-    def _few(
-        self, theta: Tensor, action: Tensor, effects: Mapping[str, Any], seed: int
-    ) -> Tensor:
-        with forked_generators(seed, "deterministic"):
-            return self._run(theta, action, row_seeds(seed, len(theta)), effects)
 
     def _run(
         self,
@@ -272,30 +249,32 @@ class SimulatorModel(Shown):
         effects: Mapping[str, Any],
     ) -> Tensor:
         theta, action = torch.as_tensor(theta), torch.as_tensor(action)
-        effects = {**self._own_conditions(theta, action, effects), **effects}
-        self._check(theta, action, effects)
-        require_conditions(self._needs, effects)
+        require_rows(theta, action)
+        self._require_names("parameters", self.parameter_names, theta, "theta")
+        given = {**self._own_conditions(theta, action, effects), **effects}
         if self.fn_takes_seeds and seeds is None:
             seeds = torch.randint(2**62, (len(theta),))
-        keywords = {}
-        if self.setup is not None:
-            keywords["context"] = self._context()
+        keywords = {} if self.setup is None else {"context": self._context()}
         if not self.is_batched:
-            x = self._run_rows(theta, action, seeds, effects, keywords)
+            x = self._run_rows(theta, action, seeds, given, keywords)
         else:
             if self.fn_takes_seeds:
                 keywords["seeds"] = copied(seeds)
-            x = self.fn(theta.clone(), action.clone(), **copied(effects), **keywords)
+            x = self.fn(theta.clone(), action.clone(), **copied(given), **keywords)
         x = outcome_tensor(x, len(theta))
-        self._square, names = square_of(x, self._square), self.channel_names
         # A trajectory of one channel has no axis of its own for it.
-        sizes = (x.shape[-1], 1) if x.ndim == 2 else (x.shape[-1],)
-        if names is not None and len(names) not in sizes:
-            raise ValueError(
-                f"expected {len(names)} channels, {', '.join(names)}; got x of shape "
-                f"{tuple(x.shape)}; name the entries of its last axis"
-            )
+        if x.ndim > 2 or len(self.channel_names or ()) != 1:
+            self._require_names("channels", self.channel_names, x, "x")
         return x
+
+    def _require_names(
+        self, what: str, names: list[str] | None, rows: Tensor, of: str
+    ) -> None:
+        """Raise if the last axis of rows has not one entry a name."""
+        fits = names is None or len(names) == rows.shape[-1]
+        expected = f"{len(names or ())} {what}, {', '.join(names or ())}"
+        got = f"{of} of shape {tuple(rows.shape)}"
+        require(fits, expected, got, "name the entries of its last axis")
 
     def _own_conditions(
         self, theta: Tensor, action: Tensor, given: Mapping[str, Any]
@@ -314,55 +293,30 @@ class SimulatorModel(Shown):
         self,
         theta: Tensor,
         action: Tensor,
-        seeds: Tensor | None,
+        seeds: Any,
         effects: Mapping[str, Any],
         keywords: Mapping[str, Any],
     ) -> np.ndarray:
-        thetas = theta.detach().cpu().double().numpy()
-        actions = action.detach().cpu().double().numpy()
-        arrays = as_arrays(effects)
-        own_seeds = [] if seeds is None else seeds.tolist()
-        rows: np.ndarray | None = None
-        for i in range(len(theta)):
-            row = [thetas[i].copy(), actions[i].copy()]
-            if self._takes_rng:
-                row.append(np.random.default_rng(own_seeds[i]))
-            x = self.fn(*row, **one_row(arrays, i), **keywords)
-            outcome = outcome_array(x)
-            if rows is None:
-                rows = np.empty((len(theta), *outcome.shape))
-            if outcome.shape != rows.shape[1:]:
-                raise ValueError(
-                    f"expected rows of one shape, {rows.shape[1:]}; got "
-                    f"{outcome.shape} in row {i}; fill what is missing with NaN"
-                )
-            rows[i] = outcome  # a copy: x may be the view of what the next row changes
-        return np.empty((0, 1)) if rows is None else rows
+        thetas, actions = (as_arrays(r.detach().cpu()) for r in (theta, action))
+        arrays, rows = as_arrays(effects), []
+        for i, seed in enumerate(seeds.tolist()):
+            row = thetas[i].copy(), actions[i].copy(), np.random.default_rng(seed)
+            x = outcome_array(self.fn(*row, **copied(at_rows(arrays, i)), **keywords))
+            rows.append(x.copy())  # x may be the view of what the next row changes
+            expected, got = (
+                f"rows of one shape, {rows[0].shape}",
+                f"{x.shape} in row {i}",
+            )
+            advice = "fill what is missing with NaN"
+            require(x.shape == rows[0].shape, expected, got, advice)
+        return np.stack(rows) if rows else np.empty((0, 1))
 
     def _context(self) -> Any:
         key = os.getpid(), self._token
         with _setting_up:
-            if key not in _contexts:
-                assert self.setup is not None
+            if key not in _contexts and self.setup is not None:
                 _contexts[key] = self.setup()
         return _contexts[key]
-
-    def _check(self, theta: Tensor, action: Tensor, effects: Mapping[str, Any]) -> None:
-        require_rows(theta, action)
-        names = self.parameter_names
-        if names is not None and theta.shape[1] != len(names):
-            raise ValueError(
-                f"expected {len(names)} parameters, {', '.join(names)}; got theta of "
-                f"shape {tuple(theta.shape)}; give one column a parameter"
-            )
-        for name, value in effects.items():
-            if name not in self.effect_names and not self._takes_any:
-                known = ", ".join(map(repr, self.effect_names)) or "none"
-                raise TypeError(
-                    f"expected effects among the keyword arguments of fn, {known}; got "
-                    f"{name!r}; add it to fn, with its null value as the default"
-                )
-            require_rows_each(name, value, len(theta))
 
 
 def takes_seeds(simulator: Callable[..., Any]) -> bool:

@@ -11,7 +11,6 @@ from torch.distributions import Distribution
 
 from sbi_active.expected import require
 from sbi_active.messages import warn
-from sbi_active.seeding import forked_generators
 from sbi_active.simulation.bank.bank import Bank
 from sbi_active.simulation.outcomes import Outcome, Simulations
 from sbi_active.support import log_density
@@ -48,27 +47,6 @@ class ReusedRows:
     def simulations(self) -> Simulations:
         """Return the rows, in the order of the weights."""
         return self.bank.read(self.rows)
-
-    def resample(self, num_rows: int, *, seed: int) -> Simulations:
-        """Return rows of equal weight, drawn by systematic resampling.
-
-        A row of large weight appears several times, so these are worth no more than
-        the effective sample size.
-
-        Args:
-            num_rows: Rows to return.
-            seed: Seed of the draw and the order.
-
-        References:
-            Douc, Cappe & Moulines, Comparison of resampling schemes, ISPA 2005.
-        """
-        with forked_generators(seed, "resample"):
-            offset = torch.rand((), dtype=torch.float64)
-            order = torch.randperm(num_rows)
-        points = (torch.arange(num_rows, dtype=torch.float64) + offset) / num_rows
-        # The cumulative sum ends at one but for rounding.
-        chosen = torch.searchsorted(self.weights.cumsum(0), points)
-        return self.bank.read(self.rows[chosen.clamp(max=len(self) - 1)[order]])
 
 
 def reuse(

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from sbi_active.arrays import all_finite, measured, own_tensor
+from sbi_active.expected import require
 
 FEW_VALUES = 4  # outcomes for each whole number among them, at least: they are counts
 
@@ -46,21 +47,19 @@ def outcome_tensor(
         ValueError: If the output does not have ``num_rows`` rows of real numbers, or
             has a finite one beyond ``dtype``.
     """
-    _require_outcome(x)
-    x = own_tensor(x, dtype)
-    if x.ndim == 0 or x.shape[0] != num_rows:
-        raise ValueError(
-            f"expected x with one row a parameter set, shape ({num_rows}, ...); got "
-            f"{tuple(x.shape)}; return its rows stacked along axis 0, or wrap a "
-            "function of one row, SimulatorModel(fn, batched=False)"
-        )
+    x = own_tensor(_outcome(x), dtype)
+    require(
+        x.ndim > 0 and len(x) == num_rows,
+        f"x with one row a parameter set, shape ({num_rows}, ...)",
+        tuple(x.shape),
+        "return its rows stacked along axis 0, or wrap a function of one row, "
+        "SimulatorModel(fn, batched=False)",
+    )
     if x.ndim == 1:  # one number a row
         x = x[:, None]
-    if not x.shape[1:].numel():
-        raise ValueError(
-            f"expected at least one number a row of x; got shape {tuple(x.shape)}; "
-            "return what was measured, and NaN where there is no measurement"
-        )
+    expected, got = "at least one number a row of x", f"shape {tuple(x.shape)}"
+    advice = "return what was measured, and NaN where there is no measurement"
+    require(x.shape[1:].numel() > 0, expected, got, advice)
     return x
 
 
@@ -73,17 +72,17 @@ def outcome_array(x: Any) -> np.ndarray:
     """
     if type(x) is np.ndarray and x.dtype == np.float64:
         return x
-    _require_outcome(x)
-    return measured(x).numpy()
+    return measured(_outcome(x)).numpy()
 
 
-def _require_outcome(x: Any) -> None:
-    """Raise if there is none; it counts as an exception of the simulator."""
+def _outcome(x: Any) -> Any:
+    """Return an outcome; that there is none counts as an exception of the simulator."""
     if x is None:
         raise RuntimeError(
             "expected an outcome from the simulator; got None; return x, with NaN "
             "where there is no measurement"
         )
+    return x
 
 
 def require_rows(theta: Tensor, action: Tensor) -> None:
@@ -92,42 +91,17 @@ def require_rows(theta: Tensor, action: Tensor) -> None:
     Raises:
         ValueError: If a row is not finite; it names the first.
     """
-    if theta.ndim != 2 or action.ndim != 2 or len(theta) != len(action):
-        raise ValueError(
-            "expected theta (n, theta_dim) and action (n, action_dim) with as many "
-            f"rows; got {tuple(theta.shape)} and {tuple(action.shape)}; repeat the "
-            "action for each row"
-        )
+    require(
+        theta.ndim == action.ndim == 2 and len(theta) == len(action),
+        "theta (n, theta_dim) and action (n, action_dim) with as many rows",
+        f"{tuple(theta.shape)} and {tuple(action.shape)}",
+        "repeat the action for each row",
+    )
     for name, rows in (("theta", theta), ("action", action)):
         if not all_finite(rows):
             first = int(torch.nonzero(~rows.isfinite().all(1))[0, 0])
-            raise ValueError(
-                f"expected finite {name}; got {rows[first].tolist()} in row {first}; "
-                "remove NaN and inf"
-            )
-
-
-def square_of(x: Tensor, before: int | None) -> int | None:
-    """Return the rows of the last x that was as wide as it was long.
-
-    Args:
-        x: Outcomes, shape (n, *x_shape).
-        before: Value that this returned for earlier ones; None for none.
-
-    Raises:
-        ValueError: If that was so for two numbers of rows: each outcome has a number
-            for each row.
-    """
-    num_rows = len(x)
-    if num_rows == 1 or x.shape != (num_rows, num_rows) or before == num_rows:
-        return before
-    if before is None:
-        return num_rows
-    raise ValueError(
-        f"expected x of one shape a row; got {tuple(x.shape)}, and {(before, before)} "
-        f"of {before} rows, as where theta[:, 0] of shape (n,) meets action of shape "
-        "(n, 1); index both alike, as in theta[:, :1]"
-    )
+            got = f"{rows[first].tolist()} in row {first}"
+            require(False, f"finite {name}", got, "remove NaN and inf")
 
 
 def require_noise(x: Tensor, again: Tensor) -> None:

@@ -73,7 +73,7 @@ def test_equal_actions_with_other_inputs_are_other_rows():
 def test_a_function_of_one_row_gets_its_own_inputs():
     shapes = []
 
-    def one(theta, action, *, inputs, times, input_times, start):
+    def one(theta, action, rng, *, inputs, times, input_times, start):
         shapes.append((inputs["u"].shape, times.shape, input_times.shape, start.shape))
         return theta * inputs["u"].sum() + start[0]
 

@@ -48,16 +48,12 @@ def test_a_log_has_a_column_each_for_a_sensor_and_an_input_of_one_name():
     robot = from_mjcf(*arm, **given, recordings=[log])
     assert robot.trials.inputs["hinge"].unique().item() == pytest.approx(0.3)
     del log["hinge control"]
-    with pytest.raises(ValueError, match="column hinge control .*recording 0"):
+    with pytest.raises(ValueError, match="column hinge control "):
         from_mjcf(*arm, **given, recordings=[log])
 
 
 def out_of_range(frame):
     frame["push"] *= 6
-
-
-def nan_input(frame):
-    frame.loc[7, "push"] = np.nan
 
 
 def renamed(frame):
@@ -80,10 +76,9 @@ def started_apart(frame):
     ("spoil", "message"),
     [
         (without_rows, "samples in recording 1; got no rows"),
-        (started_apart, "start slide in recording 1 beside none in recording 0"),
+        (started_apart, "the same columns in each recording; .*start slide, "),
         (out_of_range, "within its ctrlrange, -5 to 5"),
-        (nan_input, "finite number in column push, row 8; .* recording 1"),
-        (renamed, "column push for input; .* recording 1; did you mean 'pusher'"),
+        (renamed, "the same columns in each recording; .*pusher"),
         (backwards, "times that increase .* recording 1"),
     ],
 )
@@ -98,8 +93,18 @@ def test_a_start_state_that_is_not_told_is_refused():
     frames = logs()
     for frame in frames:
         frame["start slide"] = np.where(np.arange(len(frame)) == 0, np.nan, 0.1)
-    with pytest.raises(ValueError, match="start slide in the first row of recording 0"):
+    with pytest.raises(ValueError, match="number in column start slide, row 1 "):
         from_mjcf(SPRING_MASS, {"cart.mass": (0.5, 2)}, recordings=frames)
+
+
+@pytest.mark.filterwarnings("ignore:2 of 200 cells")
+def test_an_input_that_is_not_told_is_held():
+    frames = logs()
+    frames[1].loc[7, "push"] = np.nan
+    with pytest.warns(UserWarning, match="1 rows .* a measurement and no input"):
+        robot = from_mjcf(SPRING_MASS, {"cart.mass": (0.5, 2)}, recordings=frames)
+    push = robot.trials.inputs["push"][1]
+    assert push[7] == push[6]
 
 
 def encoder_log(**changes):
@@ -153,7 +158,10 @@ def test_angles_that_wrap_or_are_degrees_are_said():
     ("changes", "message"),
     [
         ({"time": encoder_log()["time"] + 1.7e9}, "subtract the time at which"),
-        ({"angle": ["0.1 rad"] * 50}, "number in column angle, row 1; got '0.1 rad'"),
+        (
+            {"angle": ["0.1 rad"] * 50},
+            "number in column angle, row 1 .*; got .0.1 rad.",
+        ),
     ],
 )
 def test_a_log_that_is_no_log_is_refused(changes, message):

@@ -50,7 +50,7 @@ def test_a_pendulum_moves_as_one_stepped_by_hand():
         assert x[row].numpy() == pytest.approx(np.array(angles)[10::10], abs=1e-12)
 
 
-def test_rows_do_not_depend_on_batches_workers_or_threads():
+def test_rows_do_not_depend_on_batches_or_workers():
     robot = pendulum()
     theta, action = robot.prior.sample((70,)), RELEASE.sample((70,))
     x = simulate(robot.simulator, theta, action, seed=0).x
@@ -58,9 +58,7 @@ def test_rows_do_not_depend_on_batches_workers_or_threads():
         assert (
             simulate(robot.simulator, theta, action, seed=0, **options).x == x
         ).all()
-    threads = pendulum(threads=2).simulator
-    again = threads.mean(theta, action)
-    assert (again == robot.simulator.mean(theta, action)).all()
+    again = robot.simulator.mean(theta, action)
     one = torch.cat([robot.simulator.mean(t[None], a[None])
                      for t, a in zip(theta[:9], action[:9], strict=True)])  # fmt: skip
     assert (one == again[:9]).all()
@@ -184,11 +182,6 @@ def test_a_state_that_diverges_is_invalid_and_counted():
 def test_what_does_not_fit_is_said(change, message):
     with pytest.raises(ValueError, match=message):
         pendulum(**change)
-
-
-def test_a_parameter_that_changes_nothing_is_said_at_once():
-    with pytest.warns(UserWarning, match="bob.com_y change nothing that is read"):
-        pendulum(parameters={"hinge.damping": (0, 0.1), "bob.com_y": (-0.1, 0.1)})
 
 
 def test_the_belief_of_a_campaign_is_kept(tmp_path):

@@ -113,7 +113,7 @@ def test_a_clean_simulator_is_ready(check, text):
         (RAISES, "RuntimeError: no model file"),
         (FLAT, "of one shape; got (2,) a row from 16 rows and (1,) from one"),
         (NOTHING, "no row has a measurement"),
-        (MIXED, "rows permuted with their seeds do not give permuted x"),
+        (MIXED, "x depends on which rows are simulated together"),
         (NO_PARAMETER, "no parameter changes x"),
     ],
 )

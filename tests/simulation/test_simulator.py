@@ -168,22 +168,9 @@ def test_a_function_of_one_row_says_so():
     def row(theta, action, rng):
         return theta * action + rng.normal()
 
-    with pytest.raises(ValueError, match="pass batched=False"):
-        SimulatorModel(row)
+    with pytest.raises(TypeError, match="'rng'"):
+        SimulatorModel(row)(*ROWS)
     with pytest.raises(ValueError, match="batched=False"):
         simulate(lambda theta, action: theta[0] * action[0], *ROWS, seed=0)
     with pytest.raises(SimulationError, match="batched=False"):
         simulate(lambda theta, action: {}[float(theta[0, 0])], *ROWS, seed=0)
-
-
-def test_a_function_of_one_row_may_leave_out_the_generator():
-    def row(theta, action, *, push=0.0):
-        return theta * action + push
-
-    model = SimulatorModel(row, batched=False, noise=0.1)
-    exact = ROWS[0].double() * ROWS[1].double()
-    assert torch.equal(model.mean(*ROWS), exact)
-    assert torch.equal(model.mean(*ROWS, push=2.0), exact + 2)
-    assert model.effect_names == ("push",)
-    drag = SimulatorModel(lambda t, a, drag=0.0: t * a - drag, batched=False, noise=0.1)
-    assert torch.equal(drag.mean(*ROWS, drag=1.0), exact - 1)

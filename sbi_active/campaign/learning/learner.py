@@ -29,6 +29,7 @@ from sbi_active.campaign.learning.methods import find_method
 from sbi_active.campaign.learning.rounds import Round
 from sbi_active.campaign.score import score_outcome
 from sbi_active.campaign.state import UNSCORED, CampaignState, Trial
+from sbi_active.expected import require
 from sbi_active.identifiability.known import note_combinations
 from sbi_active.inference.beliefs.belief import information_gained, named
 from sbi_active.inference.beliefs.diagnostics import Diagnostics
@@ -40,7 +41,6 @@ from sbi_active.inference.trainers.base import ActiveInference
 from sbi_active.messages import warn
 from sbi_active.seeding import derive_seed, forked_generators
 from sbi_active.simulation import simulate
-from sbi_active.simulation.simulator import square_of
 from sbi_active.simulation.workers.store import SimulationBudgetError
 
 
@@ -329,7 +329,13 @@ class Learner:
         options: Any = {"seed": derive_seed(self.state.seed, "probe", 1)}
         options |= {"workers": workers}
         x = simulate(self.simulator, theta, action, check_noise=True, **options).x
-        if square_of(x, None) is not None:  # by chance, or is it one for each row?
+        if x.shape == (len(x), len(x)):  # by chance, or is it one for each row?
             fewer = simulate(self.simulator, theta[1:], action[1:], **options)
-            square_of(fewer.x, len(x))
+            require(
+                fewer.x.shape[1:] == x.shape[1:],
+                "x of one shape a row",
+                f"{tuple(fewer.x.shape)} and {tuple(x.shape)}, as where theta[:, 0] of "
+                "shape (n,) meets action of shape (n, 1)",
+                "index both alike, as in theta[:, :1]",
+            )
         return x.shape[1:]

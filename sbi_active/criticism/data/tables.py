@@ -72,7 +72,7 @@ def read_trials(
     """
     parts, columns = _parts(table, "the table", columns)
     source = str(table) if isinstance(table, str | Path) else "the table"
-    headers = _headers(parts)
+    headers = headers_of(parts)
     known, beside = _names(headers), None
     if inputs is not None:
         beside = _inputs_beside(inputs, columns or {}, units or {})
@@ -91,7 +91,7 @@ def read_trials(
     for file, frame in parts.items():
         expected = "a header, and one row a trial or sample"
         require(len(frame) > 0, expected, f"no rows in {file}", "write them")
-    return _trials(Cells(parts, found, source), beside)
+    return arguments_of(Cells(parts, found, source), beside)
 
 
 def find_recordings(folder: Path) -> list[Path]:
@@ -142,7 +142,7 @@ def _parts(
     return frames, columns and {**columns, TRIAL: TRIAL}
 
 
-def _headers(parts: Mapping[str, pd.DataFrame]) -> list[str]:
+def headers_of(parts: Mapping[str, pd.DataFrame]) -> list[str]:
     """Return the columns of all files, which have to be the same."""
     first, *_ = parts
     own = [*parts[first].columns]
@@ -168,7 +168,7 @@ def _inputs_beside(
 ) -> Cells:
     """Return the rows of a table of inputs."""
     parts, _ = _parts(table, "the table of inputs")
-    headers = _headers(parts)
+    headers = headers_of(parts)
     source, names = next(iter(parts)), _names(headers)
     told = None
     if "input" in columns:  # what else is said holds for it where it has such columns
@@ -187,8 +187,13 @@ def _inputs_beside(
     return Cells(parts, found, source)
 
 
-def _trials(cells: Cells, beside: Cells | None) -> dict[str, Any]:
-    """Return the arguments of the trials."""
+def arguments_of(cells: Cells, beside: Cells | None = None) -> dict[str, Any]:
+    """Return the arguments of ``Trials``.
+
+    Args:
+        cells: Rows of the trials.
+        beside: Rows of their inputs at times of their own; None for none.
+    """
     columns, first, names = cells.columns, cells.first, cells.names
     members = cells.members
     action = np.empty((len(first), 0))
@@ -290,7 +295,10 @@ def _require_distinct(cells: Cells, action: Array, samples: list[Array]) -> None
         has = np.isfinite(own[:, 1:])
         if not (has.any() if cells.is_long else has.all()):
             continue
-        one = seen.setdefault(np.append(action[t], own).tobytes(), t)
+        at = cells.members[t]
+        inputs = [cells.numbers(c, empty=True)[at] for c in cells.columns["input"]]
+        told = np.concatenate([action[t], own.ravel(), *inputs])
+        one = seen.setdefault(told.tobytes(), t)
         got = f"the same numbers in {'trials' if cells.is_long else 'rows'} "
         got += f"{cells.names[one]} and {cells.names[t]} of {cells.source}"
         require(one == t, "each trial once", got, AGAIN)

@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 import torch
 
-from sbi_active.actions import ActionSpace
 from sbi_active.criticism.data.trials import Trials
 from sbi_active.criticism.effects.augmented import AugmentedSimulator
 from sbi_active.criticism.effects.effect import Context, Effect
@@ -27,7 +26,6 @@ def mjcf_effects(
     model: Any,
     *,
     trials: Trials | None = None,
-    actions: ActionSpace | None = None,
     include: str | Sequence[str] = "*",
     exclude: str | Sequence[str] = (),
 ) -> list[Effect]:
@@ -54,30 +52,28 @@ def mjcf_effects(
     ============= ==================================================================
 
     Args:
-        model: The simulator of :func:`.from_mjcf` or :func:`.from_sysid`, or what they
-            return, or an ``MjSpec``, a path or the text of an MJCF.
+        model: What :func:`.from_mjcf` or :func:`.from_sysid` returns, or an ``MjSpec``,
+            a path or the text of an MJCF.
         trials: Trials whose actions and inputs say how the robot moves; None takes
             those of a robot, else its signals or actions, else it is released around
             its start.
-        actions: Actions in place of the robot's.
         include: Pattern of names that are kept, as in "\* friction loss", or several.
         exclude: Patterns of names that are left out.
 
     Raises:
         ValueError: If a pattern fits no effect.
     """
-    simulator, every, call = _offered(model, trials, actions)
+    simulator, every, call = _offered(model, trials)
     return _that_matter(simulator, picked(every, include, exclude), call)
 
 
-def likely_effects(robot: Robot, trials: Trials) -> list[Effect]:
+def likely_effects(robot: Robot) -> list[Effect]:
     """Return effects that joints and drives most often have and an MJCF does not say.
 
     Args:
-        robot: Robot from its MJCF.
-        trials: Trials whose actions and inputs say how it moves.
+        robot: Robot from its MJCF, with recordings.
     """
-    simulator, every, call = _offered(robot, trials, None)
+    simulator, every, call = _offered(robot, None)
     likely = ("* friction loss", "* quadratic damping", "* stiffness", "* lag")
     fitted_by_these = ("* sensor lag", "* cubic *", "* quadratic stiffness", "all *")
     some = picked(every, likely, fitted_by_these, strict=False)
@@ -85,21 +81,12 @@ def likely_effects(robot: Robot, trials: Trials) -> list[Effect]:
 
 
 def _offered(
-    model: Any, trials: Trials | None, actions: ActionSpace | None
+    model: Any, trials: Trials | None
 ) -> tuple[SimulatorModel, list[Effect], dict[str, Any]]:
     """Return the simulator, all effects of its model, and rows to try them on."""
-    simulator = model
-    if isinstance(model, Robot):
-        simulator = model.simulator
-        actions, trials = actions or model.actions, trials or model.trials
-    elif not isinstance(model, SimulatorModel):
-        simulator = from_spec(model)
-    if not isinstance(simulator.fn, MujocoFunction):
-        raise TypeError(
-            "expected a simulator of from_mjcf or from_sysid; got another; pass the "
-            "MJCF, or write down its effects"
-        )
-    sizes, call = nominal(simulator, trials, actions)
+    robot = model if isinstance(model, Robot) else from_spec(model)
+    simulator, trials = robot.simulator, trials or robot.trials
+    sizes, call = nominal(simulator, trials, robot.actions)
     driven: list[str] = []
     if trials is not None and trials.inputs is not None:
         driven = [*trials.inputs]
@@ -107,10 +94,10 @@ def _offered(
         driven = [*simulator.inputs.inputs(simulator.inputs.sample((1,), seed=0))]
     sd = getattr(simulator.noise, "sd", None)
     noise = None if sd is None else torch.as_tensor(sd).reshape(-1).tolist()
-    channels = simulator.fn.channels
+    function: MujocoFunction = simulator.fn  # pyright: ignore[reportAssignmentType]
     every = [
         effect
-        for element in elements(channels, sizes, driven=driven, noise=noise)
+        for element in elements(function.channels, sizes, driven=driven, noise=noise)
         for effect in element.effects()
     ]
     return simulator, every, call

@@ -10,7 +10,6 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from typing import Any
 
-import numpy as np
 from typing_extensions import override
 
 from sbi_active.arrays import Array
@@ -89,23 +88,3 @@ class StateChange(ModelChange):
     @override
     def write(self, model: Any, phi: Array) -> None:
         """Write nothing before the state is known."""
-
-
-def require_changes(name: str, value: Any) -> dict[Any, Array]:
-    """Return changes with float64 arrays of shape (n, k).
-
-    Raises:
-        TypeError: If it is no dict of them.
-    """
-    if value is None:
-        return {}
-    if not isinstance(value, dict):
-        raise TypeError(
-            f"expected {name} as {{change: phi}}; got {type(value).__name__}; pass "
-            "changes of sbi_active.mujoco.models.changes, with phi of shape (n, k)"
-        )
-    found = {}
-    for key, phi in value.items():
-        rows = np.asarray(phi, dtype=np.float64)
-        found[key] = rows if rows.ndim == 2 else rows.reshape(len(rows), -1)
-    return found

@@ -11,12 +11,11 @@ from typing import Any
 import numpy as np
 
 from sbi_active.arrays import Array
-from sbi_active.expected import require
 from sbi_active.mujoco.models.changes import Insertion, ModelChange, StateChange
-from sbi_active.mujoco.models.names import names_of, start_places
+from sbi_active.mujoco.models.names import start_places
 from sbi_active.mujoco.models.parameters import Bounded, Writer, renew, writer_of
 from sbi_active.mujoco.models.quantities import field_of, set_field
-from sbi_active.mujoco.models.spec import Source, mujoco, quiet
+from sbi_active.mujoco.models.spec import Source, mujoco
 
 #: Rows and models at a time: more gain nothing, and each has memory of its own.
 POOL = 32
@@ -162,24 +161,6 @@ class Machine:
 
     def __getstate__(self) -> dict[str, Any]:
         return {**vars(self), "_models": {}}
-
-    def require_inertia(self) -> None:
-        """Raise if a joint has no inertia at the lowest parameters.
-
-        Every state would then be NaN, and the outcome would count as invalid.
-        """
-        low = np.array([p.low for p in self.parameters])
-        with quiet():
-            inertia = self._model(()).written(0, low, {}).dof_M0
-        lost = self.model.dof_jntid[~(inertia > mujoco.mjMINVAL)]
-        joints = [names_of(self.model, "joint")[joint] for joint in lost[:1]]
-        bounds = ", ".join(f"{p.name} = {p.low:g}" for p in self.parameters)
-        require(
-            not joints,
-            "joints that have inertia",
-            f"none of {', '.join(map(repr, joints))} at {bounds}",
-            "raise the lower bounds of masses above 0, or give the joint an armature",
-        )
 
     def batches(
         self, rows: Rows, size: int

@@ -58,12 +58,9 @@ def require_name(name: str, known: Iterable[str], what: str) -> None:
     if name in known:
         return
     hint = did_you_mean(name, known, "correct it")
-    listed = ", ".join(map(repr, known[:12])) or "none"
-    more = f" and {len(known) - 12} more" if len(known) > 12 else ""
-    article = "an" if what[0] in "aeiou" else "a"
+    some = ", ".join(map(repr, known[:12])) or "none"
     raise ValueError(
-        f"expected the name of {article} {what} among {listed}{more}; got {name!r}; "
-        f"{hint}"
+        f"expected the name of one {what}, as are {some}; got {name!r}; {hint}"
     )
 
 

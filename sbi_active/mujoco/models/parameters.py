@@ -116,14 +116,8 @@ def bounded(model: Any, parameters: Mapping[str, Any]) -> tuple[Bounded, ...]:
     require(bool(parameters), "at least one parameter", "none", advice)
     found = []
     for name, given in parameters.items():
-        try:
-            low, high, what = given if len(given) == 3 else (*given, name)
-            low, high = float(low), float(high)
-        except (TypeError, ValueError) as error:
-            raise ValueError(
-                f"expected parameter {name!r} as (low, high), or (low, high, quantity "
-                f"or function of the spec); got {given!r}; pass its bounds"
-            ) from error
+        low, high, what = given if len(given) == 3 else (*given, name)
+        low, high = float(low), float(high)
         if callable(what):
             found.append(Bounded(name, low, high, edit=what))
             continue

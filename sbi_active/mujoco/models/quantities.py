@@ -9,7 +9,7 @@ are multiples, so that it is written without another compilation; MuJoCo's
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from operator import attrgetter
 from typing import Any
@@ -96,8 +96,8 @@ class Attribute:
         index = (int(field_of(model, self.by)[i]) if self.by else i, *self.place)
         if self.field.startswith("opt."):
             index = self.place
-        own = [] if self.field == GRAVITY else [Entry(self.field, index, self.factor)]
-        return own + (self.further(model, i) if self.further else [])
+        own = Entry(self.field, index, self.factor)
+        return [own, *(self.further(model, i) if self.further else ())]
 
 
 def _inertia(model: Any, i: int) -> list[Entry]:
@@ -114,18 +114,6 @@ def _servo(model: Any, i: int) -> list[Entry]:
     return [Entry("actuator_biasprm", (i, 1), -1.0)] if is_servo else []
 
 
-def _gravity(model: Any, i: int) -> list[Entry]:
-    """Return the components of gravity, the largest first."""
-    g = model.opt.gravity
-    size = float(np.linalg.norm(g)) or 1.0
-    return [
-        Entry(GRAVITY, (k,), float(g[k]) / size)
-        for k in sorted(range(3), key=lambda k: -abs(g[k]))
-        if g[k] or not g.any()
-    ]
-
-
-GRAVITY = "opt.gravity"
 #: Fields that say that a frame is another's, and no longer hold for a center of mass.
 FRAMES = ("body_sameframe", "geom_sameframe")
 KP = Attribute(
@@ -156,7 +144,6 @@ ATTRIBUTES: dict[str, dict[str, Attribute]] = {
     },
     "actuator": {
         "gear": Attribute("actuator_gear", (0,)),
-        "gain": replace(KP, unit=""),
         "kp": KP,
         "kv": Attribute("actuator_biasprm", (2,), "{N} s/{L}", factor=-1.0),
         "timeconst": Attribute("actuator_dynprm", (0,), "s"),
@@ -174,7 +161,6 @@ ATTRIBUTES: dict[str, dict[str, Attribute]] = {
         "frictionloss": Positive("tendon_frictionloss"),
     },
     "option": {
-        "gravity": Attribute(GRAVITY, unit="m/s^2", further=_gravity),
         "density": Attribute("opt.density", unit="kg/m^3"),
         "viscosity": Attribute("opt.viscosity", unit="Pa s"),
     },

@@ -74,18 +74,14 @@ class Run:
         ):
             mujoco.mj_setState(self.models[i], data, state, kind)
 
-    def readings(self, *, threads: int = 1) -> Array:
-        """Return the sensors' readings, NaN throughout for a row that diverged.
+    def readings(self) -> Array:
+        """Return the sensors' readings, shape (n, steps, sensordata).
 
-        Args:
-            threads: Threads of MuJoCo's rollout.
-
-        Returns:
-            Shape (n, steps, sensordata).
+        They are NaN throughout for a row that diverged.
         """
         if self.model.inserted:
             self._settle()
-        x, finished = _stepped(self) if self.rows.is_stepped else _rolled(self, threads)
+        x, finished = _stepped(self) if self.rows.is_stepped else _rolled(self)
         x[~finished] = np.nan
         return x
 
@@ -125,17 +121,16 @@ def initial(model: Any, data: Any, key: int | None = None) -> Array:
     return np.concatenate(parts)
 
 
-def _rolled(run: Run, threads: int) -> tuple[Array, Array]:
+def _rolled(run: Run) -> tuple[Array, Array]:
     """Return readings by MuJoCo's rollout, and which rows came to their end."""
     steps = run.controls.shape[1]
     state, sensors = mujoco.rollout.rollout(
         run.models,
-        [mujoco.MjData(run.model.base) for _ in range(threads)],
+        mujoco.MjData(run.model.base),
         run.state,
         run.controls,
         control_spec=kinds()[1],
         nstep=steps,
-        persistent_pool=threads > 1,
     )
     # A rollout ends where MuJoCo warns, and repeats its last state from there on.
     span = steps * np.array([m.opt.timestep for m in run.models])

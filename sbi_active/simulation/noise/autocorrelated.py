@@ -7,11 +7,11 @@ from typing import Any
 
 import torch
 from torch import Tensor
-from torch.distributions import Distribution
 from typing_extensions import Self, override
 
 from sbi_active.arrays import own_tensor
-from sbi_active.simulation.noise.base import LOG_2PI, ScaleNoise, standard_normals
+from sbi_active.expected import require
+from sbi_active.simulation.noise.base import ScaleNoise, standard_normals
 from sbi_active.simulation.noise.posterior import Cells, NoisePosterior, SdGrid
 
 
@@ -51,18 +51,25 @@ class AutocorrelatedNoise(ScaleNoise):
         torch.Size([3])
     """
 
+    _num_axes = 2
+
     def __init__(
         self,
         sd: float | Tensor,
         correlation_time: float | Tensor,
         *,
-        posterior: Distribution | None = None,
+        posterior: NoisePosterior | None = None,
         measurement_sd: float | Tensor | Sequence[float] | None = None,
     ) -> None:
-        super().__init__(
-            sd, shared={"correlation_time": correlation_time}, posterior=posterior
-        )
-        self.measurement_sd = _measurement_sd(measurement_sd)
+        super().__init__(sd, posterior=posterior, correlation_time=correlation_time)
+        self.measurement_sd = None
+        if measurement_sd is not None:
+            sds = own_tensor(measurement_sd, torch.float64, name="measurement_sd")
+            is_positive = sds.ndim < 2 and bool(((sds > 0) & sds.isfinite()).all())
+            advice = "give the sensor's error in the units of x, one number or one a "
+            advice += "channel, or None"
+            require(is_positive, "measurement_sd > 0", measurement_sd, advice)
+            self.measurement_sd = sds if sds.numel() > 1 else float(sds)
 
     @classmethod
     def unknown(
@@ -103,48 +110,24 @@ class AutocorrelatedNoise(ScaleNoise):
         """
         several = torch.as_tensor(sd).ndim == 2
         pairs: Any = [*sd] if several else [sd]
-        for name, (low, high) in (
-            *(("sd", pair) for pair in pairs),
-            ("correlation_time", correlation_time),
-        ):
-            if not 0 < low < high:
-                raise ValueError(
-                    f"expected bounds 0 < low < high of {name}; got {low:g} and "
-                    f"{high:g}; pass the orders of magnitude that are possible"
-                )
+        for low, high in (*pairs, correlation_time):
+            expected = "bounds 0 < low < high of sd and correlation_time"
+            advice = "pass the orders of magnitude that are possible"
+            require(0 < low < high, expected, f"{low:g} and {high:g}", advice)
         sds = torch.stack([_edges(low, high, num_sds) for low, high in pairs])
         times = _edges(*correlation_time, num_times)
-        prior = NoisePosterior(
-            SdGrid(sds, _uniform(num_sds).expand(num_times, len(pairs), num_sds)),
-            shared=Cells(times, _uniform(num_times)),
-        )
-        middles = [(low * high) ** 0.5 for low, high in (*pairs, correlation_time)]
-        each = torch.tensor(middles[:-1], dtype=torch.float64)
+        each = _uniform(num_sds).expand(num_times, len(pairs), num_sds)
+        middles = [(low * high) ** 0.5 for low, high in pairs]
         return cls(
-            each if several else middles[0],
-            correlation_time=middles[-1],
-            posterior=prior,
+            torch.tensor(middles, dtype=torch.float64) if several else middles[0],
+            (correlation_time[0] * correlation_time[1]) ** 0.5,
+            posterior=NoisePosterior(
+                SdGrid(sds, each), shared=Cells(times, _uniform(num_times))
+            ),
             measurement_sd=measurement_sd,
         )
 
-    def _check(self, parameters: Tensor) -> None:
-        super()._check(parameters)
-        tau = parameters[..., -1]
-        if not bool((tau.isfinite() & (tau >= 0)).all()):
-            raise ValueError(
-                f"expected a correlation time >= 0; got {tau.tolist()}; give it in "
-                "seconds"
-            )
-
-    def _check_shape(self, shape: torch.Size) -> None:
-        if len(shape) == 2 and self._num_sd > 1:
-            raise ValueError(
-                f"expected outcomes of shape (n, T, {self._num_sd}), time before "
-                f"channels; got {tuple(shape)}; give one standard deviation where x "
-                "has a time axis only"
-            )
-        super()._check_shape(shape)
-
+    @override
     def _draw(self, seeds: Tensor | None, shape: torch.Size, rows: Tensor) -> Tensor:
         normal = standard_normals(seeds, shape).reshape(len(rows), shape[1], -1)
         ratio = time_stamps(self.times, shape).diff() / rows[:, -1:]
@@ -154,35 +137,15 @@ class AutocorrelatedNoise(ScaleNoise):
             path.append(
                 rho[:, t, None] * path[-1] + spread[:, t, None] * normal[:, t + 1]
             )
-        noise = torch.stack(path, 1).reshape(shape)
-        return self._spread(rows[:, :-1], shape) * noise
-
-    def _log_density(self, residual: Tensor, rows: Tensor) -> Tensor:
-        tau, sd = rows[:, -1], rows[:, :-1]
-        square, log_factor, count = self._summed(residual, tau)
-        density = -0.5 * square / sd**2 - count * (sd.log() + 0.5 * LOG_2PI)
-        return (density - 0.5 * log_factor).sum(1)
-
-    def _log_evidence(self, residual: Tensor, p: NoisePosterior, cell: int) -> Tensor:
-        tau = torch.full_like(residual[:, 0].flatten(1)[:, 0], p.cells[cell][0])
-        square, log_factor, count = self._summed(residual, tau)
-        return p.sd.log_evidence(square, count, cell) - 0.5 * log_factor
-
-    def _summed(self, residual: Tensor, tau: Tensor) -> Sequence[Tensor]:
-        """Return squares of innovations, log factors and counts, (n, channels)."""
-        parts = innovations(residual, tau, self.times)
-        return [*map(self._by_channel, (*parts, (~residual.isnan()).double()))]
+        return self._by_row(rows, shape) * torch.stack(path, 1).reshape(shape)
 
     @override
-    def whiten(self, value: Tensor) -> Tensor:
-        v = value.double()
-        tau = self.parameters[-1].double().expand(len(v))
-        change, variance = chained(v, tau, self.times)
-        return super().whiten((change / variance.sqrt()).reshape(v.shape))
+    def _innovations(self, residual: Tensor, shared: float) -> tuple[Tensor, Tensor]:
+        return innovations(residual, shared, self.times)
 
 
 def innovations(
-    residual: Tensor, tau: Tensor, times: Tensor | None
+    residual: Tensor, tau: float, times: Tensor | None
 ) -> tuple[Tensor, Tensor]:
     r"""Whiten residuals, up to the standard deviation, by the Markov chain.
 
@@ -194,44 +157,25 @@ def innovations(
 
     Args:
         residual: Residuals, shape (n, T, ...), NaN where not observed.
-        tau: Correlation times, shape (n,).
+        tau: Correlation time.
         times: Times, shape (T,) or (n, T); None for 0, 1, 2, ...
 
     Returns:
-        :math:`u_t^2` and :math:`\log(1 - \rho^2)`, zero if not observed, shapes (n,
-        T, rest).
+        :math:`u_t` and :math:`\log(1 - \rho^2)`, NaN where not observed, of the
+        residual's shape.
     """
-    change, variance = chained(residual, tau, times)
-    observed = ~change.isnan()
-    square, log_factor = change.square() / variance, variance.log()
-    return torch.where(observed, square, 0.0), torch.where(observed, log_factor, 0.0)
-
-
-def chained(
-    residual: Tensor, tau: Tensor, times: Tensor | None
-) -> tuple[Tensor, Tensor]:
-    r"""Return the innovation at each time, and its variance in those of the residual.
-
-    Arguments are those of :func:`innovations`.
-
-    Returns:
-        :math:`e_t - \rho e_s`, NaN where not observed, and :math:`1 - \rho^2`, shapes
-        (n, T, rest).
-    """
-    e = residual.flatten(2) if residual.ndim > 2 else residual[..., None]
+    e = residual.reshape(*residual.shape[:2], -1)
     stamp = time_stamps(times, residual.shape).to(e.device)[..., None].expand(e.shape)
-    observed = ~e.isnan()
-    index = torch.arange(e.shape[1], device=e.device)[:, None].expand(e.shape[1:])
-    index = torch.where(observed, index, -1)
-    before = torch.full_like(index[:, :1], -1)
-    before = torch.cat([before, index.cummax(1).values[:, :-1]], 1)
-    source = before.clamp_min(0)
-    first = before < 0
-    step = torch.where(first, torch.inf, stamp - stamp.gather(1, source))
-    ratio = step / tau[:, None, None]
-    rho, variance = torch.exp(-ratio), -torch.expm1(-2 * ratio)
+    place = torch.arange(e.shape[1], device=e.device)[:, None]
+    last = torch.where(e.isnan(), -1, place).cummax(1).values
+    before = torch.nn.functional.pad(last[:, :-1], (0, 0, 1, 0), value=-1)
+    first, source = before < 0, before.clamp_min(0)
+    ratio = torch.where(first, torch.inf, stamp - stamp.gather(1, source)) / tau
+    variance = -torch.expm1(-2 * ratio)
     past = torch.where(first, 0.0, e.gather(1, source))
-    return e - rho * past, variance
+    u = (e - torch.exp(-ratio) * past) / variance.sqrt()
+    log_variance = torch.where(e.isnan(), torch.nan, variance.log())
+    return u.reshape(residual.shape), log_variance.reshape(residual.shape)
 
 
 def time_stamps(times: Tensor | None, shape: Sequence[int]) -> Tensor:
@@ -255,21 +199,6 @@ def time_stamps(times: Tensor | None, shape: Sequence[int]) -> Tensor:
             "and drop repeated stamps"
         )
     return times.expand(n, num)
-
-
-def _measurement_sd(
-    value: float | Tensor | Sequence[float] | None,
-) -> float | Tensor | None:
-    """Return a number, or a copy of one a channel, or raise where one is not > 0."""
-    if value is None:
-        return None
-    sds = own_tensor(value, torch.float64, name="measurement_sd")
-    if sds.ndim > 1 or not bool(((sds > 0) & sds.isfinite()).all()):
-        raise ValueError(
-            f"expected measurement_sd > 0; got {value}; give the sensor's error in the "
-            "units of x, one number or one a channel, or None"
-        )
-    return sds if sds.numel() > 1 else float(sds)
 
 
 def _edges(low: float, high: float, num: int) -> Tensor:

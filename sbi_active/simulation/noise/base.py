@@ -1,18 +1,18 @@
-"""Interface of a noise model, and the base of those with a standard deviation."""
+"""Interface of a noise model, and the family with a standard deviation a channel."""
 
 from __future__ import annotations
 
 import copy
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from typing import Any
 
 import torch
 from torch import Tensor
-from torch.distributions import Distribution
 from typing_extensions import Self, override
 
 from sbi_active.arrays import own_tensor
+from sbi_active.expected import require
 from sbi_active.seeding import forked_generators, row_normals, row_uniforms
 from sbi_active.simulation.noise.posterior import NoisePosterior
 
@@ -49,7 +49,7 @@ class NoiseModel(ABC):
 
     parameter_names: tuple[str, ...] = ()
     parameters: Tensor = torch.empty(0, dtype=torch.float64)
-    posterior: Distribution | None = None
+    posterior: Any = None
     times: Tensor | None = None
     measurement_sd: float | Tensor | None = None
     is_known_gaussian: bool = False
@@ -118,172 +118,151 @@ class NoiseModel(ABC):
 class ScaleNoise(NoiseModel):
     r"""Noise with a standard deviation and further parameters common to all channels.
 
-    This class has the checks and shapes, and sums over a posterior; its noise is
-    independent and Gaussian. Another kind implements ``_draw`` and ``_log_density``
-    given parameters, and ``_log_evidence`` given a cell of what channels share if it is
-    Gaussian.
+    This class has the checks, the shapes and the densities of Gaussian noise, whose
+    numbers are independent once they are whitened by :meth:`_innovations`; it is
+    independent noise. A subclass says how numbers depend on each other, and draws them.
 
     Args:
         sd: Standard deviation, in the units of x; a number, or one a channel (the last
             axis of x). Its parameters are named "sd", or "sd_1", "sd_2", ...
-        shared: Further parameters by name, which follow those.
-        posterior: Posterior of the parameters, event shape (p,). One that
-            :func:`.estimate_noise` did not make is represented by 256 fixed draws of
-            equal weight.
+        posterior: Posterior of the parameters, event shape (p,), as
+            :func:`.estimate_noise` makes it.
+        **shared: Further parameters, which follow those.
+
+    Raises:
+        ValueError: If a parameter is negative or not finite.
     """
 
-    _is_gaussian = True
+    #: Axes of x, rows among them, that are no channels.
+    _num_axes = 1
 
     def __init__(
         self,
         sd: float | Tensor,
         *,
-        shared: Mapping[str, float | Tensor] | None = None,
-        posterior: Distribution | None = None,
+        posterior: NoisePosterior | None = None,
+        **shared: float | Tensor,
     ) -> None:
         self.sd = own_tensor(sd, torch.float64, name="sd")
-        if self.sd.ndim > 1:
-            raise ValueError(
-                "expected a standard deviation that is a number or one a channel; got "
-                f"shape {tuple(self.sd.shape)}; give shape () or (channels,)"
-            )
-        self._num_sd = self.sd.numel()
-        shared = {} if shared is None else shared
-        names = [f"sd_{c + 1}" for c in range(self._num_sd)] if self.sd.ndim else ["sd"]
-        self.parameter_names = (*names, *shared)
-        values = [own_tensor(v, torch.float64, name=k) for k, v in shared.items()]
-        self.parameters = torch.cat(
-            [self.sd.reshape(-1), *(v.reshape(1) for v in values)]
+        require(
+            self.sd.ndim < 2,
+            "a standard deviation that is a number or one a channel",
+            f"shape {tuple(self.sd.shape)}",
+            "give shape () or (channels,)",
         )
+        self._num_sd = self.sd.numel()
+        names = [f"sd_{c + 1}" for c in range(self._num_sd)] if self.sd.ndim else ["sd"]
+        values = [own_tensor(v, torch.float64, name=k) for k, v in shared.items()]
+        self.parameter_names = (*names, *shared)
+        self.parameters = torch.cat([v.reshape(-1) for v in (self.sd, *values)])
         self.posterior = posterior
-        self._table: Tensor | None = None
-        self._check(self.parameters)
+        self.is_known_gaussian = posterior is None
+        named = zip(self.parameter_names, self.parameters.tolist(), strict=True)
+        for name, value in named:
+            expected = f"a finite {name} >= 0"
+            require(0 <= value < math.inf, expected, value, "correct it")
 
     def __repr__(self) -> str:
-        values = self.parameters[self._num_sd :].tolist()
-        names = self.parameter_names[self._num_sd :]
-        parts = {"sd": self.sd.tolist(), **dict(zip(names, values, strict=True))}
+        named = [*zip(self.parameter_names, self.parameters.tolist(), strict=True)]
+        parts = {"sd": self.sd.tolist(), **dict(named[self._num_sd :])}
         text = ", ".join(f"{k}={v}" for k, v in parts.items())
         known = "" if self.posterior is None else ", with a posterior"
         return f"{type(self).__name__}({text}{known})"
 
-    @property
-    def is_known_gaussian(self) -> bool:  # pyright: ignore
-        """Whether it is Gaussian and nothing of it is unknown."""
-        return self._is_gaussian and self.posterior is None
-
     @override
     def sample(self, mean: Tensor, seeds: Tensor | None = None) -> Tensor:
-        shape = mean.shape
-        self._check_shape(shape)
+        shape, num = mean.shape, len(self.parameters)
+        self._require_channels(shape)
         rows = self.parameters.expand(len(mean), -1)
         if self.posterior is not None:
-            rows = self._draw_parameters(seeds, shape)
-            self._check(rows)
+            if seeds is None:
+                uniform = torch.rand(len(mean), num, dtype=torch.float64)
+            else:  # behind the numbers that the noise itself takes
+                uniform = row_uniforms(seeds, num, first=2 * math.prod(shape[1:]))
+            rows = self.posterior.quantile(uniform)
         return mean + self._draw(seeds, shape, rows).to(mean)
 
     @override
     def log_prob(self, x: Tensor, mean: Tensor) -> Tensor:
-        x, mean = _broadcast(x, mean)
-        self._check_shape(x.shape)
+        x, mean = torch.broadcast_tensors(x.double(), mean.double())
+        self._require_channels(x.shape)
         observed = ~x.isnan()
         impossible = observed & ~(x.isfinite() & mean.isfinite())
         residual = torch.where(observed & ~impossible, x - mean, torch.nan)
         if self.posterior is not None:
-            density = self._marginal(residual)
+            density = self._log_marginal(residual, self.posterior)
         else:
-            if not bool((self.parameters[: self._num_sd] > 0).all()):
-                raise ValueError(
-                    "expected a standard deviation > 0 for a density; got 0, at which "
-                    "there is none; give the noise of every channel"
-                )
-            rows = self.parameters.expand(len(x), -1).to(x.device)
-            density = self._log_density(residual, rows)
+            is_positive = bool((self.sd > 0).all())
+            expected = "a standard deviation > 0 for a density"
+            advice = "give the noise of every channel"
+            require(is_positive, expected, "0, at which there is none", advice)
+            terms = torch.where(residual.isnan(), 0.0, self._log_density(residual))
+            density = terms.flatten(1).sum(1)
         return density.masked_fill(impossible.flatten(1).any(1), -torch.inf)
+
+    @override
+    def whiten(self, value: Tensor) -> Tensor:
+        return self._innovations(value.double(), self._shared)[0] / self.sd
 
     def _draw(self, seeds: Tensor | None, shape: torch.Size, rows: Tensor) -> Tensor:
         """Return noise of a shape (n, *x_shape), float64, by parameters (n, p)."""
-        return self._spread(rows, shape) * standard_normals(seeds, shape)
+        return self._by_row(rows, shape) * standard_normals(seeds, shape)
 
-    def _log_density(self, residual: Tensor, rows: Tensor) -> Tensor:
-        """Return log densities (n,) of residuals, NaN where not observed."""
-        sd = self._spread(rows, residual.shape)
-        density = -0.5 * (residual / sd) ** 2 - torch.log(sd) - 0.5 * LOG_2PI
-        return observed_terms(density, residual).flatten(1).sum(1)
+    def _log_density(self, residual: Tensor) -> Tensor:
+        """Return log densities of numbers given those before, of the residual's shape.
 
-    def _marginal(self, residual: Tensor) -> Tensor:
-        """Return log densities (n,) averaged over the posterior.
-
-        It is exact for Gaussian noise and a posterior of this library, else by fixed
-        draws.
+        The residual is NaN where x was not observed, and what is returned there is
+        ignored.
         """
-        posterior = self.posterior
-        if self._is_gaussian and isinstance(posterior, NoisePosterior):
-            terms = [
-                self._log_evidence(residual, posterior, k).sum(1) + log_p
-                for k, (_, log_p) in enumerate(posterior.cells)
-            ]
-            return torch.stack(terms).logsumexp(0)
-        draws = self._fixed_draws().to(residual.device)
-        each = draws[:, None].expand(-1, len(residual), -1)
-        terms = [self._log_density(residual, rows) for rows in each]
-        return torch.stack(terms).logsumexp(0) - math.log(len(draws))
+        u, log_variance = self._innovations(residual, self._shared)
+        sd = self.sd.to(residual)
+        return -0.5 * (u / sd) ** 2 - sd.log() - 0.5 * LOG_2PI - 0.5 * log_variance
 
-    def _log_evidence(self, residual: Tensor, p: NoisePosterior, cell: int) -> Tensor:
-        """Return log densities by channel with its size summed out, (n, num_sd)."""
-        square = self._by_channel(observed_terms(residual.square(), residual))
-        count = self._by_channel((~residual.isnan()).double())
-        return p.sd.log_evidence(square, count, cell)
+    def _log_marginal(self, residual: Tensor, posterior: NoisePosterior) -> Tensor:
+        """Return log densities (n,) with the parameters summed out, exactly."""
+        count = self._by_channel(~residual.isnan())
+        terms = []
+        for cell, (shared, log_p) in enumerate(posterior.cells):
+            u, log_variance = self._innovations(residual, shared)
+            known = u.square(), log_variance.expand(u.shape)
+            square, factor = (self._by_channel(part) for part in known)
+            each = posterior.sd.log_evidence(square, count, cell) - 0.5 * factor
+            terms.append(each.sum(1) + log_p)
+        return torch.stack(terms).logsumexp(0)
 
-    def _check(self, parameters: Tensor) -> None:
-        """Raise if parameters (..., p) are outside their range."""
-        sd = parameters[..., : self._num_sd]
-        if not bool((sd.isfinite() & (sd >= 0)).all()):
-            raise ValueError(
-                f"expected a standard deviation >= 0; got {sd.tolist()}; give it in "
-                "the units of x"
-            )
+    def _innovations(self, residual: Tensor, shared: float) -> tuple[Tensor, Tensor]:
+        """Return independent numbers of variance sd^2, and log variances in sd^2.
 
-    def _check_shape(self, shape: torch.Size) -> None:
+        Args:
+            residual: Residuals, shape (n, *x_shape), NaN where not observed.
+            shared: The parameter that channels share.
+        """
+        return residual, torch.zeros(())
+
+    @property
+    def _shared(self) -> float:
+        return float(self.parameters[-1])
+
+    def _require_channels(self, shape: torch.Size) -> None:
         """Raise if outcomes (n, *x_shape) do not fit the channels."""
-        if len(shape) < 2 or self._num_sd not in (1, shape[-1]):
-            raise ValueError(
-                f"expected outcomes of shape (n, ..., {self._num_sd}), one standard "
-                f"deviation a channel; got {tuple(shape)}; give one number, or one "
-                "an entry of the last axis"
-            )
+        num = shape[-1] if len(shape) > self._num_axes else 1
+        require(
+            len(shape) > 1 and self._num_sd in (1, num),
+            f"outcomes of shape (n, ..., {self._num_sd}), one standard deviation a "
+            "channel",
+            tuple(shape),
+            "give one number, or one an entry of the last axis",
+        )
 
-    def _draw_parameters(self, seeds: Tensor | None, shape: torch.Size) -> Tensor:
-        """Return one draw of the posterior a row, shape (n, p)."""
-        num = len(self.parameter_names)
-        if seeds is None:
-            uniform = torch.rand(shape[0], num, dtype=torch.float64)
-        else:  # behind the numbers that the noise itself takes
-            uniform = row_uniforms(seeds, num, first=2 * math.prod(shape[1:]))
-        if isinstance(self.posterior, NoisePosterior):
-            return self.posterior.quantile(uniform)
-        draws = self._fixed_draws()
-        return draws[(uniform[:, 0] * len(draws)).long()]
-
-    def _fixed_draws(self, *, num: int = 256) -> Tensor:
-        if self._table is None:
-            assert self.posterior is not None
-            with forked_generators(0, "noise posterior"):
-                self._table = self.posterior.sample((num,)).double()
-        return self._table
-
-    def _spread(self, sd: Tensor, shape: torch.Size) -> Tensor:
-        """Return standard deviations (n, channels) for shape (n, *x_shape)."""
-        return sd.reshape(len(sd), *[1] * (len(shape) - 2), self._num_sd)
+    def _by_row(self, rows: Tensor, shape: torch.Size) -> Tensor:
+        """Return standard deviations among parameters (n, p), for (n, *x_shape)."""
+        return rows[:, : self._num_sd].reshape(len(rows), *[1] * (len(shape) - 2), -1)
 
     def _by_channel(self, terms: Tensor) -> Tensor:
         """Return sums over all but the channels, (n, *x_shape) -> (n, num_sd)."""
-        return terms.reshape(len(terms), -1, self._num_sd).sum(1)
-
-
-def observed_terms(terms: Tensor, residual: Tensor) -> Tensor:
-    """Return terms of a sum, zero if the residual was not observed."""
-    return torch.where(residual.isnan(), 0.0, terms)
+        return (
+            terms.double().nan_to_num(0.0).reshape(len(terms), -1, self._num_sd).sum(1)
+        )
 
 
 def standard_normals(seeds: Tensor | None, shape: torch.Size) -> Tensor:
@@ -291,14 +270,3 @@ def standard_normals(seeds: Tensor | None, shape: torch.Size) -> Tensor:
     if seeds is None:
         return torch.randn(shape, dtype=torch.float64)
     return row_normals(seeds, math.prod(shape[1:])).reshape(shape)
-
-
-def _broadcast(x: Tensor, mean: Tensor) -> tuple[Tensor, Tensor]:
-    try:
-        x, mean = torch.broadcast_tensors(x.double(), mean.double())
-    except RuntimeError as error:
-        raise ValueError(
-            "expected a mean broadcastable to x; got shapes "
-            f"{tuple(mean.shape)} and {tuple(x.shape)}; give one mean a row"
-        ) from error
-    return x, mean

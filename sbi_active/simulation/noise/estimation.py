@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
-from typing import Literal, TypeVar
+from collections.abc import Sequence
+from typing import Literal
 
 import numpy as np
 import torch
-from scipy.linalg import helmert
 from torch import Tensor
 
 from sbi_active.expected import require
@@ -18,7 +17,6 @@ from sbi_active.simulation.noise.autocorrelated import (
     innovations,
     time_stamps,
 )
-from sbi_active.simulation.noise.base import NoiseModel
 from sbi_active.simulation.noise.gaussian import GaussianNoise
 from sbi_active.simulation.noise.posterior import (
     Cells,
@@ -26,7 +24,6 @@ from sbi_active.simulation.noise.posterior import (
     NoisePosterior,
 )
 
-Kind = TypeVar("Kind", bound=NoiseModel)
 NoiseKind = Literal["gaussian", "autocorrelated"]
 
 Array = Tensor | np.ndarray
@@ -38,7 +35,7 @@ def estimate_noise(
     kind: NoiseKind = "gaussian",
     times: Tensor | None = None,
     pooled: bool = False,
-) -> NoiseModel:
+) -> GaussianNoise | AutocorrelatedNoise:
     r"""Return a noise model with a posterior over its parameters.
 
     Every group of repeats has a mean of its own, which is integrated out under a flat
@@ -83,20 +80,25 @@ def estimate_noise(
         >>> noise.parameters, noise.posterior.sample((5,)).shape
         (tensor([1.5275], dtype=torch.float64), torch.Size([5, 1]))
     """
-    require(
-        kind in ("gaussian", "autocorrelated"),
-        "kind among 'gaussian', 'autocorrelated'",
-        repr(kind),
-        "choose one of these, or declare StudentTNoise(sd, df)",
-    )
+    kinds = "gaussian", "autocorrelated"
+    advice = "choose one of these, or declare StudentTNoise(sd, df)"
+    require(kind in kinds, f"kind among {kinds}", repr(kind), advice)
+    is_timed = kind == "autocorrelated"
     groups = _groups(repeats)
-    shape = groups[0].shape[1:]
-    trajectory = kind == "autocorrelated" and len(shape) == 1
-    num_sd = 1 if pooled or trajectory else shape[-1]
-    if kind == "gaussian":
-        noise = _gaussian(groups, num_sd)
+    contrast = torch.cat([_contrasts(group, whole=is_timed) for group in groups])
+    shape = contrast.shape
+    num_sd = 1 if pooled or (is_timed and len(shape) == 2) else shape[-1]
+    freedom = (~contrast.isnan()).double().reshape(-1, num_sd).sum(0)
+    advice = "repeat the trial, or set pooled=True"
+    _require_channels(freedom > 0, "at least 2 repeats of every channel", advice)
+    square = contrast.square().nan_to_num(0.0).reshape(-1, num_sd).sum(0)
+    advice = "measure with more digits, or declare the noise, GaussianNoise(sd)"
+    _require_channels(square > 0, "repeats that differ", advice)
+    if is_timed:
+        noise = _autocorrelated(contrast, freedom, times)
     else:
-        noise = _autocorrelated(groups, num_sd, times)
+        sd = InverseChiSquare(freedom, (square / freedom)[None])
+        noise = GaussianNoise(_point(sd, 0), posterior=NoisePosterior(sd))
     return noise if times is None else noise.at(times)
 
 
@@ -105,21 +107,15 @@ def _groups(repeats: Array | Sequence[Array]) -> list[Tensor]:
     single = isinstance(repeats, Tensor | np.ndarray)
     groups = [torch.as_tensor(g).double() for g in ([repeats] if single else repeats)]
     groups = [g[:, None] if g.ndim == 1 else g for g in groups]
-    if not groups or any(
-        g.ndim < 2 or g.shape[1:] != groups[0].shape[1:] for g in groups
-    ):
-        raise ValueError(
-            "expected repeats of shape (k, *x_shape), or groups of such; got "
-            f"{[tuple(g.shape) for g in groups]}; give a list of tensors of one "
-            "x_shape"
-        )
+    shapes = [tuple(g.shape) for g in groups]
+    is_one = len({shape[1:] for shape in shapes}) == 1 and len(shapes[0]) > 1
+    expected = "repeats of shape (k, *x_shape), or groups of such"
+    require(is_one, expected, shapes, "give a list of tensors of one x_shape")
     groups = [g[g.flatten(1).isfinite().any(1)] for g in groups]
     freedom = sum(max(len(g) - 1, 0) for g in groups)
-    if freedom == 0:
-        raise ValueError(
-            f"expected at least 2 repeats of one action; got {len(groups[0])}; "
-            "repeat a trial: without repeats nothing separates noise from the system"
-        )
+    advice = "repeat a trial: without repeats nothing separates noise from the system"
+    num = len(groups[0])
+    require(freedom > 0, "at least 2 repeats of one action", num, advice)
     if freedom == 1:
         warn(
             "SA212 expected at least 3 repeats to estimate noise; got 2, from which "
@@ -129,43 +125,35 @@ def _groups(repeats: Array | Sequence[Array]) -> list[Tensor]:
     return [g for g in groups if len(g) > 1]
 
 
-def _gaussian(groups: list[Tensor], num_sd: int) -> GaussianNoise:
-    square, freedom = _sums_of_squares(groups, num_sd)
-    sd = InverseChiSquare(freedom, (square / freedom)[None])
-    return _noise(GaussianNoise, sd)
+def _contrasts(group: Tensor, *, whole: bool) -> Tensor:
+    r"""Return independent numbers of mean zero that have the noise's own covariance.
+
+    Each repeat less the mean of those before, times :math:`\sqrt{k / (k + 1)}`, by
+    Helmert; NaN where there is none.
+
+    Args:
+        group: Repeats, shape (n, *x_shape).
+        whole: Whether a number that one repeat lacks counts in none of them, so that
+            all numbers of a contrast have the same weights.
+    """
+    seen = ~group.isnan()
+    if whole:
+        seen = seen.all(0).expand(group.shape)
+    values = torch.where(seen, group, 0.0)
+    count = seen.double().cumsum(0) - 1
+    off = values - (values.cumsum(0) - values) / count
+    off = off * (count / (count + 1)).sqrt()
+    return torch.where(seen & (count > 0), off, torch.nan)
 
 
-def _sums_of_squares(groups: list[Tensor], num_sd: int) -> tuple[Tensor, Tensor]:
-    """Return squares around the means of groups and their degrees of freedom."""
-    square = torch.zeros(num_sd, dtype=torch.float64)
-    freedom = torch.zeros(num_sd, dtype=torch.float64)
-    for group in groups:
-        deviation = (group - group.nanmean(0)).square().nansum(0)
-        count = ((~group.isnan()).sum(0) - 1).clamp_min(0)
-        square += deviation.reshape(-1, num_sd).sum(0)
-        freedom += count.reshape(-1, num_sd).sum(0)
-    _require_scatter(square, freedom)
-    return square, freedom
-
-
-def _require_scatter(square: Tensor, freedom: Tensor) -> None:
-    if bool((freedom == 0).any()):
-        raise ValueError(
-            "expected at least 2 repeats of every channel; got none for channels "
-            f"{torch.nonzero(freedom == 0)[:, 0].tolist()}; repeat the trial, or "
-            "set pooled=True"
-        )
-    if bool((square <= 0).any()):
-        raise ValueError(
-            "expected repeats that differ; got identical ones in channels "
-            f"{torch.nonzero(square <= 0)[:, 0].tolist()}; measure with more "
-            "digits, or declare the noise, GaussianNoise(sd)"
-        )
+def _require_channels(holds: Tensor, expected: str, advice: str) -> None:
+    channels = torch.nonzero(~holds)[:, 0].tolist()
+    require(not channels, expected, f"none in channels {channels}", advice)
 
 
 def _autocorrelated(
-    groups: list[Tensor],
-    num_sd: int,
+    contrast: Tensor,
+    freedom: Tensor,
     times: Tensor | None,
     *,
     cells: int = 96,
@@ -179,51 +167,35 @@ def _autocorrelated(
     correlation could be seen, and ``longest`` times the recording. Cells at its ends of
     less than a ``negligible`` share of the largest weight are left out.
     """
-    # Contrasts are independent, of mean zero, and have the noise's own covariance.
-    # A number missing in one repeat is missing in all contrasts of its group.
-    contrast = torch.cat(
-        [
-            (torch.from_numpy(helmert(len(g))) @ g.flatten(1)).reshape(-1, *g.shape[1:])
-            for g in groups
-        ]
-    )
-    if contrast.shape[1] < 3:
-        raise ValueError(
-            "expected x with a time axis of at least 3 samples; got x of shape "
-            f"{tuple(contrast.shape[1:])}; estimate kind='gaussian'"
-        )
-    stamps = time_stamps(times, (1, contrast.shape[1]))[0]
+    shape = contrast.shape
+    expected = "x with a time axis of at least 3 samples"
+    advice = "estimate kind='gaussian'"
+    require(shape[1] > 2, expected, f"x of shape {tuple(shape[1:])}", advice)
+    stamps = time_stamps(times, (1, shape[1]))[0]
     edges = torch.logspace(
         math.log10(shortest * float(stamps.diff().min())),
         math.log10(longest * float(stamps[-1] - stamps[0])),
         cells + 1,
         dtype=torch.float64,
     )
-    freedom = (~contrast.isnan()).double().reshape(-1, num_sd).sum(0)
     squares, log_weight = [], []
-    for tau in (edges[1:] * edges[:-1]).sqrt():
-        square, log_factor = innovations(contrast, tau.expand(len(contrast)), times)
-        square = square.reshape(-1, num_sd).sum(0)
-        _require_scatter(square, freedom)
+    for tau in (edges[1:] * edges[:-1]).sqrt().tolist():
+        u, log_variance = innovations(contrast, tau, times)
+        square = u.square().nan_to_num(0.0).reshape(-1, len(freedom)).sum(0)
         squares.append(square)
-        log_weight.append(
-            -0.5 * log_factor.sum() - 0.5 * (freedom * square.log()).sum()
-        )
+        log_det = log_variance.nansum() + (freedom * square.log()).sum()
+        log_weight.append(-0.5 * log_det)
     weight = torch.stack(log_weight)
     heavy = (weight > weight.max() + math.log(negligible)).nonzero()[:, 0]
     kept = slice(int(heavy[0]), int(heavy[-1]) + 1)
     shared = Cells(edges[kept.start : kept.stop + 1], weight[kept].log_softmax(0))
     sd = InverseChiSquare(freedom, torch.stack(squares)[kept] / freedom)
-    return _noise(AutocorrelatedNoise, sd, shared)
+    cell, tau = shared.quantile(torch.tensor(0.5, dtype=torch.float64))
+    posterior = NoisePosterior(sd, shared=shared)
+    return AutocorrelatedNoise(_point(sd, int(cell)), tau, posterior=posterior)
 
 
-def _noise(
-    kind: Callable[..., Kind], sd: InverseChiSquare, shared: Cells | None = None
-) -> Kind:
-    """Return noise with a posterior, at s and the median of what channels share."""
-    cell, values = torch.tensor(0), list[Tensor]()
-    if shared is not None:
-        cell, *values = shared.quantile(torch.tensor(0.5, dtype=torch.float64))
-    middle = sd.middle(cell)
-    middle = middle[0] if len(middle) == 1 else middle
-    return kind(middle, *values, posterior=NoisePosterior(sd, shared=shared))
+def _point(sd: InverseChiSquare, cell: int) -> Tensor:
+    """Return s of a cell, a number where all channels have one."""
+    s = sd.variance[cell].sqrt()
+    return s[0] if len(s) == 1 else s

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from torch import Tensor
-from torch.distributions import Distribution
 
 from sbi_active.simulation.noise.base import ScaleNoise
+from sbi_active.simulation.noise.posterior import NoisePosterior
 
 
 class GaussianNoise(ScaleNoise):
@@ -31,6 +31,6 @@ class GaussianNoise(ScaleNoise):
     """
 
     def __init__(
-        self, sd: float | Tensor, *, posterior: Distribution | None = None
+        self, sd: float | Tensor, *, posterior: NoisePosterior | None = None
     ) -> None:
         super().__init__(sd, posterior=posterior)

@@ -14,7 +14,7 @@ from typing import Any
 import torch
 from scipy.special import chdtri
 from torch import Tensor
-from torch.distributions import Distribution, constraints
+from torch.distributions import Distribution
 
 
 @dataclass(frozen=True)
@@ -37,23 +37,12 @@ class InverseChiSquare:
         """Number of standard deviations."""
         return len(self.freedom)
 
-    def middle(self, cell: Tensor) -> Tensor:
-        """Return s at one cell, shape (channels,)."""
-        return self.variance[cell].sqrt()
-
     def quantile(self, cell: Tensor, uniform: Tensor) -> Tensor:
         """Return sd at cells (n,) and levels (n, channels)."""
         chi_square = chdtri(self.freedom.numpy(), uniform.numpy())
         return (
             self.freedom * self.variance[cell] / torch.from_numpy(chi_square)
         ).sqrt()
-
-    def log_prob(self, cell: Tensor, sd: Tensor) -> Tensor:
-        """Return log densities (n,) of sd (n, channels) at cells (n,)."""
-        half = 0.5 * self.freedom
-        chi_square = self.freedom * self.variance[cell] / sd**2
-        log_p = half * torch.log(0.5 * chi_square) - 0.5 * chi_square
-        return (log_p - torch.lgamma(half) + math.log(2.0) - torch.log(sd)).sum(-1)
 
     def log_evidence(self, square: Tensor, count: Tensor, cell: int) -> Tensor:
         r"""Return the log density of Gaussian numbers with their size integrated out.
@@ -101,8 +90,11 @@ class Cells:
 
     def quantile(self, uniform: Tensor) -> tuple[Tensor, Tensor]:
         """Return the cell and the value at levels of the leading shape."""
-        own = self._at(uniform.shape)
-        mass = own.log_weight.exp()
+        edges, log_weight = (
+            part.expand(*uniform.shape, -1).contiguous()
+            for part in (self.edges, self.log_weight)
+        )
+        mass = log_weight.exp()
         above = mass.cumsum(-1)
         above = above / above[..., -1:]
         last = mass.shape[-1] - 1
@@ -110,24 +102,8 @@ class Cells:
         cell = torch.searchsorted(above, level).clamp_max(last)
         top, share = above.gather(-1, cell), mass.gather(-1, cell)
         within = 1 - ((top - level) / share).clamp(0, 1)
-        low, high = own.edges.gather(-1, cell), own.edges.gather(-1, cell + 1)
+        low, high = edges.gather(-1, cell), edges.gather(-1, cell + 1)
         return cell[..., 0], (low * (high / low) ** within)[..., 0]
-
-    def log_prob(self, value: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the cell and the log density of values of the leading shape."""
-        own, last = self._at(value.shape), self.log_weight.shape[-1] - 1
-        cell = torch.searchsorted(own.edges, value[..., None].contiguous()) - 1
-        cell = cell.clamp(0, last)
-        width = torch.log(own.edges[..., 1:] / own.edges[..., :-1]).gather(-1, cell)
-        log_p = own.log_weight.gather(-1, cell) - width.log()
-        inside = (value >= own.edges[..., 0]) & (value <= own.edges[..., -1])
-        log_p = torch.where(inside, log_p[..., 0] - value.log(), -torch.inf)
-        return cell[..., 0], log_p
-
-    def _at(self, shape: torch.Size) -> Cells:
-        """Return the same cells for each of some values."""
-        parts = (self.edges, self.log_weight)
-        return Cells(*(part.expand(*shape, -1).contiguous() for part in parts))
 
 
 @dataclass(frozen=True)
@@ -152,18 +128,9 @@ class SdGrid:
         """Geometric middle of the cells, shape (channels, s)."""
         return Cells(self.edges, self.log_weight).nodes
 
-    def middle(self, cell: Tensor) -> Tensor:
-        """Return the median at one cell, shape (channels,)."""
-        level = torch.full((1, self.num_channels), 0.5, dtype=torch.float64)
-        return self.quantile(cell.reshape(1), level)[0]
-
     def quantile(self, cell: Tensor, uniform: Tensor) -> Tensor:
         """Return sd at cells (n,) and levels (n, channels)."""
         return Cells(self.edges, self.log_weight[cell]).quantile(uniform)[1]
-
-    def log_prob(self, cell: Tensor, sd: Tensor) -> Tensor:
-        """Return log densities (n,) of sd (n, channels) at cells (n,)."""
-        return Cells(self.edges, self.log_weight[cell]).log_prob(sd)[1].sum(-1)
 
     def log_evidence(self, square: Tensor, count: Tensor, cell: int) -> Tensor:
         r"""Return the log density of Gaussian numbers with their size summed out.
@@ -208,11 +175,6 @@ class NoisePosterior(Distribution):
         own = self.shared.nodes.tolist(), self.shared.log_weight.tolist()
         return [*zip(*own, strict=True)]
 
-    @property
-    def support(self) -> Any:  # pyright: ignore[reportIncompatibleMethodOverride]
-        """Positive numbers."""
-        return constraints.independent(constraints.positive, 1)
-
     def sample(self, sample_shape: Sequence[int] = ()) -> Tensor:  # pyright: ignore
         """Return draws from torch's global generator, shape (*sample_shape, p)."""
         shape = (*sample_shape, *self.event_shape)
@@ -230,13 +192,3 @@ class NoisePosterior(Distribution):
         cell, value = self.shared.quantile(uniform[:, c])
         sd = self.sd.quantile(cell, uniform[:, :c])
         return torch.cat([sd, value[:, None]], 1)
-
-    def log_prob(self, value: Tensor) -> Tensor:
-        """Return log densities, (..., p) -> (...)."""
-        shape, c = value.shape[:-1], self.sd.num_channels
-        value = value.double().reshape(-1, value.shape[-1])
-        cell = torch.zeros(len(value), dtype=torch.long)
-        if self.shared is None:
-            return self.sd.log_prob(cell, value).reshape(shape)
-        cell, log_p = self.shared.log_prob(value[:, c])
-        return (log_p + self.sd.log_prob(cell, value[:, :c])).reshape(shape)

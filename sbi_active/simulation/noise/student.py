@@ -6,10 +6,12 @@ import math
 
 import torch
 from torch import Tensor
-from torch.distributions import Distribution
+from torch.distributions import StudentT
+from typing_extensions import override
 
+from sbi_active.expected import require
 from sbi_active.seeding import row_uniforms
-from sbi_active.simulation.noise.base import ScaleNoise, observed_terms
+from sbi_active.simulation.noise.base import ScaleNoise
 
 
 class StudentTNoise(ScaleNoise):
@@ -25,7 +27,6 @@ class StudentTNoise(ScaleNoise):
         sd: Standard deviation :math:`\sigma`, in the units of x; a number, or one a
             channel (the last axis of x).
         df: Degrees of freedom :math:`\nu > 2`, of all channels.
-        posterior: Posterior of (sd, df), event shape (p,).
 
     Raises:
         ValueError: If a standard deviation is negative, or df is not above 2, where
@@ -40,26 +41,13 @@ class StudentTNoise(ScaleNoise):
         -0.634...
     """
 
-    def __init__(
-        self,
-        sd: float | Tensor,
-        df: float | Tensor,
-        *,
-        posterior: Distribution | None = None,
-    ) -> None:
-        super().__init__(sd, shared={"df": df}, posterior=posterior)
+    def __init__(self, sd: float | Tensor, df: float | Tensor) -> None:
+        super().__init__(sd, df=df)
+        self.is_known_gaussian, df = False, float(self.parameters[-1])
+        expected = "df > 2, below which there is no standard deviation"
+        require(df > 2, expected, df, "use for example 4")
 
-    _is_gaussian = False
-
-    def _check(self, parameters: Tensor) -> None:
-        super()._check(parameters)
-        df = parameters[..., -1]
-        if not bool((df.isfinite() & (df > 2)).all()):
-            raise ValueError(
-                f"expected df > 2, below which there is no standard deviation; got "
-                f"{df.tolist()}; use for example 4"
-            )
-
+    @override
     def _draw(self, seeds: Tensor | None, shape: torch.Size, rows: Tensor) -> Tensor:
         num = math.prod(shape[1:])
         if seeds is None:
@@ -70,23 +58,15 @@ class StudentTNoise(ScaleNoise):
         df = rows[:, -1:]
         radius = (df * torch.expm1(-2 / df * uniform[:, :num].log())).sqrt()
         student = radius * torch.cos(2 * math.pi * uniform[:, num:])
-        scale = self._spread(_scale(rows[:, :-1], df), shape)
-        return scale * student.reshape(shape)
+        return self._scale * student.reshape(shape)
 
-    def _log_density(self, residual: Tensor, rows: Tensor) -> Tensor:
-        df = rows[:, -1:]
-        scale = self._spread(_scale(rows[:, :-1], df), residual.shape)
-        df = df.reshape(-1, *[1] * (residual.ndim - 1))
-        density = log_student(residual / scale, df) - scale.log()
-        return observed_terms(density, residual).flatten(1).sum(1)
+    @override
+    def _log_density(self, residual: Tensor) -> Tensor:
+        df, scale = self.parameters[-1], self._scale.to(residual)
+        return StudentT(df, 0.0, scale, validate_args=False).log_prob(residual)
 
-
-def log_student(z: Tensor, df: Tensor) -> Tensor:
-    """Return the log density of the standard t distribution."""
-    constant = torch.lgamma(0.5 * (df + 1)) - torch.lgamma(0.5 * df)
-    constant = constant - 0.5 * torch.log(math.pi * df)
-    return constant - 0.5 * (df + 1) * torch.log1p(z**2 / df)
-
-
-def _scale(sd: Tensor, df: Tensor) -> Tensor:
-    return sd * ((df - 2) / df).sqrt()
+    @property
+    def _scale(self) -> Tensor:
+        """Scale of the t distribution, of the shape of sd."""
+        df = self.parameters[-1]
+        return self.sd * ((df - 2) / df).sqrt()

@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from sbi_active.arrays import own_tensor
+from sbi_active.expected import require
 from sbi_active.seeding import forked_generators
 from sbi_active.simulation.model import SimulatorModel
 from sbi_active.simulation.simulator import outcome_tensor
@@ -119,10 +120,9 @@ def _is_of_the_interface(error: BaseException) -> bool:
     Such an error comes of arguments that do not fit or of rows of another shape, and
     the innermost frame of its traceback is ours and not the simulator's.
     """
-    trace = error.__traceback__
-    while trace is not None and trace.tb_next is not None:
-        trace = trace.tb_next
-    where = trace.tb_frame.f_globals.get("__name__") if trace is not None else None
+    frames = [frame for frame, _ in traceback.walk_tb(error.__traceback__)]
+    names = [frame.f_globals.get("__name__") for frame in frames]
+    where = [name for name in names if name != require.__module__][-1]
     if where == __name__:
         return isinstance(error, TypeError)
     return where in _INTERFACE and isinstance(error, ValueError | TypeError)

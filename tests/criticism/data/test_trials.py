@@ -254,7 +254,7 @@ def logs(scale=1e3, units=("ms", "mm", "mm/s")):
             f"start slide{position}": 0 * t + scale * 0.1,
         }
     )
-    return [frame, frame * 1.0]
+    return [frame, frame.assign(**{"push [N]": np.sin(6 * t)})]
 
 
 def read_robot(recordings):
@@ -283,8 +283,8 @@ def test_logs_of_a_robot_become_si_as_tables_do(tmp_path):
 @pytest.mark.parametrize(
     ("units", "message"),
     [
-        (("ms", "px", ""), r"'position' in m; got \[px\] in recording 0"),
-        (("ms", "deg", ""), r"'position' in m; got \[deg\] in recording 0"),
+        (("ms", "px", ""), r"'position' in m; got \[px\] in the rec"),
+        (("ms", "deg", ""), r"'position' in m; got \[deg\] in the rec"),
         (("mm", "", ""), r"times in s, .* got mm"),
     ],
 )

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 
+from sbi_active import SimulatorModel
 from sbi_active.simulation.fingerprint import fingerprint, require_same
 
 
@@ -64,3 +65,10 @@ def test_defaults_partial_functions_and_methods(of):
     for k, value in enumerate((whole, other)):
         with pytest.raises(ValueError, match="got another"):
             require_same("it", before[k], fingerprint(value))
+
+
+def test_source_of_the_library_changes_from_release_to_release():
+    model = SimulatorModel(Rail(1.0))
+    before = fingerprint(model)
+    before["simulator"]["source"] = "that of another release"
+    require_same("it", before, fingerprint(model))

@@ -85,22 +85,6 @@ def test_proposals_may_have_met_with_other_actions(tmp_path):
     assert abs(scores[1]) > 6  # negative control: one mixture for all actions
 
 
-def test_resampled_rows_have_equal_weight(bank):
-    reused = reuse(bank, TARGET, proposals=PROPOSALS)
-    rows = reused.resample(3_000, seed=1)
-    # The rows are draws from the weights, and these have their own error.
-    error = 0.5 * (1 / 3_000 + 1 / reused.effective_sample_size) ** 0.5
-    assert len(rows) == 3_000
-    assert abs(float(rows.theta.double().mean()) - 1.0) < 4 * error
-    assert torch.equal(reused.resample(3_000, seed=1).x, rows.x)
-    assert not torch.equal(reused.resample(3_000, seed=2).x, rows.x)
-    # Systematic: a row comes as often as its weight says, rounded up or down.
-    theta = reused.simulations().theta[:, 0]
-    best = int(reused.weights.argmax())
-    times = int((rows.theta[:, 0] == theta[best]).sum())
-    assert abs(times - 3_000 * float(reused.weights[best])) < 1
-
-
 def test_few_effective_rows_are_told(bank):
     far = normal(-7.5, 0.3)
     with pytest.warns(UserWarning, match=r"4000 rows of the bank are worth \d+\.\d"):

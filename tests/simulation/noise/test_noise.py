@@ -2,7 +2,6 @@ import numpy as np
 import pytest
 import torch
 from scipy import stats
-from torch.distributions import Independent, LogNormal
 
 from sbi_active import AutocorrelatedNoise, GaussianNoise, StudentTNoise
 from sbi_active.seeding import row_seeds
@@ -88,34 +87,6 @@ def test_a_row_depends_on_its_seed_alone(noise):
     first = noise.sample(mean)
     torch.manual_seed(1)
     assert torch.equal(noise.sample(mean), first)
-
-
-@pytest.mark.parametrize("kind", [GaussianNoise, AutocorrelatedNoise, StudentTNoise])
-def test_any_posterior_is_averaged_over_fixed_draws(kind):
-    p = 1 if kind is GaussianNoise else 2
-    center = torch.tensor([0.0, 1.5])[:p]
-    posterior = Independent(LogNormal(center, 0.1 * torch.ones(p)), 1)
-    noise = kind(*center.exp(), posterior=posterior)
-    assert len(noise.parameter_names) == p
-    x, mean = torch.randn(4, 3), torch.zeros(4, 3)
-    log_prob = noise.log_prob(x, mean)
-    assert torch.equal(log_prob, noise.log_prob(x, mean))
-    draws = posterior.sample((20_000,))
-    exact = torch.stack(
-        [
-            noise._log_density(row.expand(len(draws), -1), draws).logsumexp(0)
-            for row in x.double()
-        ]
-    ) - np.log(len(draws))
-    # 256 draws of sd to 10 %, slopes of log p to (x^2 - 1) per log sd
-    slope = ((x**2).sum(1) - 3).abs() + 3
-    assert ((log_prob - exact).abs() < 4 * 0.1 * slope / 16).all()
-    seeds = row_seeds(0, 4)
-    drawn = noise.sample(mean, seeds)
-    assert torch.equal(noise.sample(mean[2:], seeds[2:]), drawn[2:])
-    fixed = kind(*noise.parameters).sample(mean, seeds)
-    ratio = (drawn / fixed)[:, 0]
-    assert ratio.unique().numel() == 4  # each row has a draw of its own
 
 
 def test_sizes_that_are_unknown_by_channel_are_summed_channel_by_channel():
