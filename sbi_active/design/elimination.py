@@ -169,8 +169,8 @@ class GainEvaluator:
         self._is_settled = True
         if self._chosen is not None:
             chosen = self._chosen
-            self.notes = [*chosen.problems(drawn), *chosen.doubts(drawn)]
-            return drawn
+            self.notes = chosen.problems(drawn)
+            return self._with_slopes(drawn)
         num_rows = num_samples // 2 if halves else num_samples
         self._chosen, self.notes = choose_estimator(
             self.model, drawn, num_rows=num_rows
@@ -180,7 +180,15 @@ class GainEvaluator:
             sampler.summaries = None
             sampler.rewind()
             return sampler.draw(num_samples, action)
-        return drawn
+        return self._with_slopes(drawn)
+
+    def _with_slopes(self, drawn: CandidateSimulations) -> CandidateSimulations:
+        """Return simulations with slopes, as all later ones, if these need them."""
+        if not self.estimator.needs_slopes(drawn):
+            return drawn
+        assert isinstance(self.sampler, CandidateSampler)
+        self.sampler.has_slopes = True
+        return self.sampler.add_slopes(drawn)
 
     def __call__(self, simulations: CandidateSimulations) -> Tensor:
         """Return contributions, shape (a, n), nats."""

@@ -120,7 +120,7 @@ def choose_estimator(
             by_noise = NestedGain()
         problems = by_noise.problems(simulations)
         if not problems:
-            return by_noise, by_noise.doubts(simulations)
+            return by_noise, []
         notes = [f"{type(by_noise).__name__} not used: {text}" for text in problems]
     if hasattr(model, "log_posterior"):
         return PosteriorGain(), notes

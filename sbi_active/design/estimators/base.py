@@ -33,6 +33,9 @@ class CandidateSimulations:
             unlike outcomes without a measurement, whose NaN is information.
         sd: Standard deviations of the noise around the mean, as x, where rivals have
             noise of their own; else None.
+        fisher: Information matrices of the simulator's own slopes, in units of the
+            noise, shape (a, n, theta_dim, theta_dim); NaN at most parameters, None for
+            none.
         each: Actions of the rows of one candidate, shape (n, action_dim), where every
             row has its own; else None.
     """
@@ -45,6 +48,7 @@ class CandidateSimulations:
     replicate: Tensor | None = None
     missing: Tensor | None = None
     sd: Tensor | None = None
+    fisher: Tensor | None = None
     each: Tensor | None = None
 
     @property
@@ -117,7 +121,7 @@ class CandidateSimulations:
         return replace(self, theta=torch.cat([self.theta, other.theta]), **parts)
 
     def _parts(self) -> dict[str, Tensor]:
-        names = ("x", "mean", "replicate", "missing", "sd")
+        names = ("x", "mean", "replicate", "missing", "sd", "fisher")
         parts = {name: getattr(self, name) for name in names}
         return {name: part for name, part in parts.items() if part is not None}
 
@@ -201,9 +205,9 @@ class InformationGainEstimator(Shown, ABC):
         """Say in short sentences what speaks against the estimator here."""
         return []
 
-    def doubts(self, simulations: CandidateSimulations) -> list[str]:
-        """Say where estimates are off, though nothing else is likely to do better."""
-        return []
+    def needs_slopes(self, simulations: CandidateSimulations) -> bool:
+        """Return whether estimates need slopes of the simulator, see ``fisher``."""
+        return False
 
     def remarks(self, simulations: CandidateSimulations) -> list[str]:
         """Return remarks on an estimate from simulations."""
@@ -214,6 +218,15 @@ class InformationGainEstimator(Shown, ABC):
         self, model: Any, simulations: CandidateSimulations, belief: Any
     ) -> Tensor:
         """Return the contributions, shape (a, n)."""
+
+
+def noise_scale(simulations: CandidateSimulations) -> Tensor:
+    """Return the root mean square of declared noise, shape (a, numbers of x)."""
+    assert simulations.mean is not None
+    square = (simulations.x - simulations.mean).flatten(2).double().square()
+    finite = square.isfinite()
+    square = torch.where(finite, square, 0.0).sum(1) / finite.sum(1).clamp_min(1)
+    return torch.where(square > 0, square, 1.0).sqrt()
 
 
 def standard_error(contributions: Tensor) -> Tensor:
