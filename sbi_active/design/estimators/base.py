@@ -36,8 +36,6 @@ class CandidateSimulations:
         fisher: Information matrices of the simulator's own slopes, in units of the
             noise, shape (a, n, theta_dim, theta_dim); NaN at most parameters, None for
             none.
-        each: Actions of the rows of one candidate, shape (n, action_dim), where every
-            row has its own; else None.
     """
 
     theta: Tensor
@@ -49,7 +47,6 @@ class CandidateSimulations:
     missing: Tensor | None = None
     sd: Tensor | None = None
     fisher: Tensor | None = None
-    each: Tensor | None = None
 
     @property
     def counted(self) -> Tensor:
@@ -93,8 +90,6 @@ class CandidateSimulations:
 
     def rows(self) -> tuple[Tensor, Tensor]:
         """Return theta and action of every outcome in turn, a * n rows each."""
-        if self.each is not None:
-            return self.theta, self.each
         num_actions, num_samples = self.x.shape[:2]
         return (
             self.theta.repeat(num_actions, 1),
@@ -134,14 +129,11 @@ class InformationGainEstimator(Shown, ABC):
             the model.
         needs_noise: Whether it uses the declared noise, or else replicates.
         needs_model: Whether it uses something learned.
-        rowwise: Whether a contribution depends on its own row alone, as given by
-            :meth:`CandidateSimulations.rows`.
     """
 
     bound: Bound = "none"
     needs_noise: bool = False
     needs_model: bool = True
-    rowwise: bool = False
 
     def __call__(
         self,

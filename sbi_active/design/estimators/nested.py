@@ -151,8 +151,8 @@ class NestedGain(InformationGainEstimator):
         notes = presence_notes(simulations)
         if simulations.fisher is not None:
             notes.append(
-                "the emulator misses most of an action's outcomes by more than the noise; "
-                "slopes of the simulator correct its gain"
+                "the emulator misses most outcomes of an action by more than the "
+                "noise; slopes of the simulator correct its gain"
             )
         few = int((~_enough(simulations)).sum())
         if few:

@@ -53,7 +53,6 @@ class PosteriorGain(InformationGainEstimator):
     """
 
     bound: Bound = "lower"
-    rowwise = True
     batch_size: int = 50_000  # rows in one pass of the network
 
     def _contributions(
