@@ -16,7 +16,7 @@ from sbi_active.actions import ActionSpace
 from sbi_active.arrays import Array
 from sbi_active.design.coordinates import Coordinates
 from sbi_active.expected import Shown, require_least
-from sbi_active.inference.sampling.gaussian_process import GaussianProcess
+from sbi_active.inference.sampling.gaussian_process import IN_CUBE, GaussianProcess
 from sbi_active.seeding import derive_seed
 
 Score = Callable[[Tensor], Tensor]
@@ -258,7 +258,13 @@ class GradientSearch(Search):
         lacking = (least - found.probability_valid).clamp_min(0.0)
         value = found.utility - self.penalty * found.utility.std() * lacking
         known = space.points(found.action)
-        utility = space.regression(known, value, found.standard_error)
+        utility = GaussianProcess.fit(
+            known,
+            value[:, None],
+            noise=found.standard_error,
+            num_categories=len(space.sizes),
+            settings=IN_CUBE,
+        )
 
         def score(z: Tensor) -> Tensor:
             mean, variance = utility(z)

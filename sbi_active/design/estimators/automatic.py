@@ -137,7 +137,7 @@ def choose_estimator(
         return RatioGain(), [*notes, *(f"not used: {text}" for text in cautions)]
     assert by_noise is not None
     if bool(random_presence(simulations).any()):
-        return ParameterGain(range(simulations.theta.shape[1])), notes
+        return ParameterGain(), notes
     return by_noise, [*notes, "used all the same: there is no model"]
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
@@ -232,23 +231,3 @@ def at_least(value: int, least: int, name: str, usual: int) -> int:
     if value < least:
         raise ValueError(f"expected {name} >= {least}; got {value}; use about {usual}")
     return value
-
-
-def numbers_of(
-    target: Sequence[int] | Callable[[Tensor], Tensor],
-) -> Callable[[Tensor], Tensor]:
-    """Return a function of parameters (n, d) that gives those of some places, (n, k).
-
-    A function is returned as it is.
-
-    Raises:
-        ValueError: If there is no place, or one twice.
-    """
-    if callable(target):
-        return target
-    index = list(target)
-    if not index or len(set(index)) < len(index):
-        raise ValueError(
-            f"expected one or more different parameters; got {index}; name each once"
-        )
-    return lambda theta: theta[:, index]
