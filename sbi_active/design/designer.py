@@ -10,7 +10,6 @@ import torch
 from torch import Tensor
 from torch.distributions import Distribution
 
-from sbi_active.actions import ActionSpace
 from sbi_active.actions.discrete import Actions, action_space
 from sbi_active.design.design import Design
 from sbi_active.design.elimination import GainEvaluator, as_batch
@@ -20,7 +19,7 @@ from sbi_active.design.estimators.model_index import ModelIndexGain, RivalSample
 from sbi_active.design.given import design_given
 from sbi_active.design.limits import DesignLimits
 from sbi_active.design.sampler import CandidateSampler
-from sbi_active.design.search import ExhaustiveSearch, GradientSearch, Search
+from sbi_active.design.search import GradientSearch, Search
 from sbi_active.design.target import Target, target_estimator
 from sbi_active.expected import Shown, suggests
 from sbi_active.messages import warn
@@ -29,10 +28,7 @@ from sbi_active.simulation import MissingRowsWarning, Simulations
 from sbi_active.simulation.workers.settings import IN_PROCESS, Workers
 
 #: Name of a search: its class.
-SEARCHES: dict[str, type[Search]] = {
-    "exhaustive": ExhaustiveSearch,
-    "gradient": GradientSearch,
-}
+SEARCHES: dict[str, type[Search]] = {"gradient": GradientSearch}
 
 
 class InformationGainDesigner(Shown):
@@ -59,8 +55,8 @@ class InformationGainDesigner(Shown):
             first (entropies by nearest neighbors where x is one number, nested Monte
             Carlo where it is more), then the same with noise from replicates that pass
             a test of normality, else what the model can say.
-        search: A search; "exhaustive" or "gradient"; or "auto", exhaustive for lists,
-            else gradient.
+        search: Search of a space that is no list, of which all actions are compared:
+            an object, "gradient", or "auto", which is the same.
         eliminate: Start with half of the samples and spend the rest on the candidates
             still in reach of the leader; without it every candidate gets all of them.
         workers: Workers that run the simulations.
@@ -72,7 +68,7 @@ class InformationGainDesigner(Shown):
     Raises:
         ValueError: If ``num_samples`` is below 8, or the name of an estimator or a
             search is unknown.
-        TypeError: If the search does not apply to the action space.
+        TypeError: If parts of the space are neither boxes nor lists.
 
     Example:
         >>> from sbi_active import DiscreteActions, GaussianNoise, SimulatorModel
@@ -104,8 +100,12 @@ class InformationGainDesigner(Shown):
         self.num_samples = at_least(num_samples, 8, "num_samples", 1_000)
         self.actions = actions = action_space(actions)
         self.estimator, self.eliminate = estimator, eliminate
-        self.search = _find_search(search, actions)
-        self.search.size(actions)  # a search that does not apply is an error here
+        if isinstance(search, str):
+            name = "gradient" if search == "auto" else search
+            search = by_name(name, "search", SEARCHES)
+        self.search: Search = search
+        if actions.listed() is None:
+            self.search.size(actions)  # parts that it does not search are an error
         self.workers, self.most_numbers = workers, most_numbers
         find_estimator(estimator)  # an unknown name is an error here
 
@@ -207,8 +207,10 @@ class InformationGainDesigner(Shown):
                     replicates=estimator is None or estimator.needs_noise,
                 )
             gains = GainEvaluator(sampler, estimator, model, belief, limits, own)
-            objective = gains.objective(self.search, budget, self.num_samples)
-            finalists = self.search.finalists(objective)
+            finalists = listed
+            if finalists is None:
+                objective = gains.objective(self.search, budget, self.num_samples)
+                finalists = self.search.finalists(objective)
             steps.append(
                 gains.eliminate(
                     *(finalists, budget),
@@ -243,11 +245,3 @@ class InformationGainDesigner(Shown):
                 "allow more simulations or fewer candidates"
             )
         return budget
-
-
-def _find_search(search: str | Search, actions: ActionSpace) -> Search:
-    if isinstance(search, Search):
-        return search
-    if search == "auto":
-        search = "gradient" if actions.listed() is None else "exhaustive"
-    return by_name(search, "search", SEARCHES)

@@ -137,8 +137,9 @@ class GainEvaluator:
         self.sampler, self.belief = sampler, belief
         self.limits, self.seed = limits, seed
         self.num_others = len(sampler.others)
-        if self.num_others and model is not None:
-            model = JointLikelihood(model, sampler.others.shape[1])
+        if self.num_others:  # of joint outcomes nothing else says anything
+            joint = JointLikelihood(model, sampler.others.shape[1])
+            model = joint if hasattr(model, "log_likelihood") else None
         self.model: Any = model
         self._chosen, self._is_settled = estimator, False
         self.notes: list[str] = []

@@ -72,6 +72,8 @@ def test_a_bounded_belief_and_a_curve():
     entropy = -torch.special.xlogy(density, density).sum() * 0.0006
     exact = entropy - 0.5 * (math.log(2 * math.pi) + 1) - math.log(sd)
     # two modes, +- the root: a mixture is needed
-    assert_lower_bound(ParameterGain(lambda t: t[:, :1])(None, rows, belief), exact[None], 0.25)
+    assert_lower_bound(
+        ParameterGain(lambda t: t[:, :1])(None, rows, belief), exact[None], 0.25
+    )
     idle = ParameterGain(lambda t: t[:, 1:])(None, rows, belief).mean()
     assert abs(float(idle)) < 0.05
