@@ -100,10 +100,11 @@ class InformationGainDesigner(Shown):
         self.num_samples = at_least(num_samples, 8, "num_samples", 1_000)
         self.actions = actions = action_space(actions)
         self.estimator, self.eliminate = estimator, eliminate
-        if isinstance(search, str):
+        if isinstance(search, Search):
+            self.search = search
+        else:
             name = "gradient" if search == "auto" else search
-            search = by_name(name, "search", SEARCHES)
-        self.search: Search = search
+            self.search: Search = by_name(name, "search", SEARCHES)
         if actions.listed() is None:
             self.search.size(actions)  # parts that it does not search are an error
         self.workers, self.most_numbers = workers, most_numbers
