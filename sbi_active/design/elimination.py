@@ -109,46 +109,40 @@ def paired_errors(contributions: Sequence[Tensor], chosen: int) -> Tensor:
     )
 
 
+@dataclass
 class GainEvaluator:
     """Draws outcomes of candidates, estimates what these tell, and chooses one.
 
-    Args:
+    Attributes:
         sampler: Sampler of the outcomes.
-        estimator: Estimator of the information; None is chosen by the first
-            simulations.
+        chosen: Estimator of the information; None is chosen by the first simulations.
         model: Model that the estimator needs.
         belief: Distribution of the parameters; None for rivals.
         limits: Limits and costs of the actions.
         seed: Seed of the search, and of the draws behind probabilities.
-
-    Attributes:
-        notes: Notes on failed checks of the estimator, or why others were not taken.
+        notes: Notes on failed checks of the estimator, or why others were not taken;
+            None before the first simulations.
     """
 
-    def __init__(
-        self,
-        sampler: CandidateSampler | RivalSampler,
-        estimator: InformationGainEstimator | None,
-        model: Any,
-        belief: Distribution | None,
-        limits: DesignLimits,
-        seed: int,
-    ) -> None:
-        self.sampler, self.belief = sampler, belief
-        self.limits, self.seed = limits, seed
-        self.num_others = len(sampler.others)
+    sampler: CandidateSampler | RivalSampler
+    chosen: InformationGainEstimator | None
+    model: Any
+    belief: Distribution | None
+    limits: DesignLimits
+    seed: int
+    notes: list[str] | None = None
+
+    def __post_init__(self) -> None:
+        self.num_others = len(self.sampler.others)
         if self.num_others:  # of joint outcomes nothing else says anything
-            joint = JointLikelihood(model, sampler.others.shape[1])
-            model = joint if hasattr(model, "log_likelihood") else None
-        self.model: Any = model
-        self._chosen, self._is_settled = estimator, False
-        self.notes: list[str] = []
+            joint = JointLikelihood(self.model, self.sampler.others.shape[1])
+            self.model = joint if hasattr(self.model, "log_likelihood") else None
 
     @property
     def estimator(self) -> InformationGainEstimator:
         """The estimator given, or the one chosen by the first simulations."""
-        assert self._chosen is not None
-        return self._chosen
+        assert self.chosen is not None
+        return self.chosen
 
     def draw(
         self, num_samples: int, action: Tensor, *, halves: bool = False
@@ -162,22 +156,21 @@ class GainEvaluator:
         """
         sampler = self.sampler
         drawn = sampler.draw(num_samples, action)
-        if self._is_settled:
+        if self.notes is not None:
             return drawn
-        self._is_settled = True
-        if self._chosen is None:
+        if self.chosen is None:
             num_rows = num_samples // 2 if halves else num_samples
-            self._chosen, self.notes = choose_estimator(
+            self.chosen, self.notes = choose_estimator(
                 self.model, drawn, self.belief, num_rows=num_rows
             )
             # A model was learned from whole outcomes.
-            if sampler.summaries is not None and self._chosen.needs_model:
+            if sampler.summaries is not None and self.chosen.needs_model:
                 sampler.summaries = None
                 sampler.rewind()
                 return sampler.draw(num_samples, action)
         else:
-            self.notes = self._chosen.problems(drawn)
-        if not self._chosen.needs_slopes(drawn):
+            self.notes = self.chosen.problems(drawn)
+        if not self.chosen.needs_slopes(drawn):
             return drawn
         assert isinstance(sampler, CandidateSampler)
         sampler.has_slopes = True
@@ -252,7 +245,7 @@ class GainEvaluator:
 
         size = affordable(max(8, int(share * num_samples)) // 4 * 4, num_actions)
         first = self.draw(size, action, halves=True)
-        said = [*self.notes, *self.estimator.remarks(first)]
+        said = [*(self.notes or ()), *self.estimator.remarks(first)]
         halves = _halves(first)
         num_valid, num_counted = first.num_valid()
         eligible = limits.reached_by(num_valid / num_counted)
