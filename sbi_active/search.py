@@ -9,7 +9,6 @@ __getattr__ = former_names(
     {
         "BayesianOptimization": "sbi_active.design:GradientSearch",
         "Evaluations": "sbi_active.design.search:Evaluations",
-        "ExhaustiveSearch": "sbi_active.design.search:ExhaustiveSearch",
         "GradientSearch": "sbi_active.design:GradientSearch",
         "Objective": "sbi_active.design.search:Objective",
         "Search": "sbi_active.design:Search",

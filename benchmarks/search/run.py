@@ -5,7 +5,7 @@
 
 "numerical": the numerical task with any action in [-5, 5], under the prior and under
 the exact posterior after one trial at -5, also by a cost that moves the optimum off the
-end of the range; beside the exhaustive search of a grid of 101 actions. "mixed": a box
+end of the range; beside all of a grid of 101 actions. "mixed": a box
 of one or two entries with a category of three or four, the information known and of
 three local optima a category, another function each seed:
 
@@ -148,8 +148,7 @@ def is_left_out(name: str, search: str, seed: int) -> bool:
 def run(name: str, search: str, seed: int) -> dict[str, Any]:
     """Return what a search finds, and what it costs."""
     case = CASES[name](seed)
-    space = GRID if search == "exhaustive" else case.space
-    designer = InformationGainDesigner(space, search=search)
+    designer = InformationGainDesigner(GRID if search == "exhaustive" else case.space)
     start = time.process_time()
     design = designer.select(
         None, case.simulator, belief=case.belief, cost=case.cost, seed=seed

@@ -16,7 +16,6 @@ from sbi_active.design.estimators.nested import NestedGain
 from sbi_active.design.estimators.posterior import PosteriorGain
 from sbi_active.design.random_designer import RandomDesigner
 from sbi_active.design.search import GradientSearch, Search
-from sbi_active.renamed import former_names
 
 __all__ = [
     "Design",
@@ -33,15 +32,3 @@ __all__ = [
     "RatioGain",
     "Search",
 ]
-
-__getattr__ = former_names(
-    __name__,
-    {
-        "CandidateSimulations": (
-            "sbi_active.design.estimators.base:CandidateSimulations"
-        ),
-        "Evaluations": "sbi_active.design.search:Evaluations",
-        "InfoNCEGain": "sbi_active.design.estimators.contrast:InfoNCEGain",
-        "Objective": "sbi_active.design.search:Objective",
-    },
-)

@@ -6,7 +6,6 @@ import torch
 from torch import Tensor
 
 from sbi_active.actions import ActionSpace, BoxActions
-from sbi_active.inference.sampling.gaussian_process import IN_CUBE, GaussianProcess
 
 
 class Coordinates:
@@ -82,18 +81,6 @@ class Coordinates:
         apart = (point[:, :c] - other[:c]).square().sum(1).sqrt()
         same = (point[:, c:] == other[c:]).all(1)
         return apart.masked_fill(~same, torch.inf)
-
-    def regression(
-        self, point: Tensor, value: Tensor, error: Tensor
-    ) -> GaussianProcess:
-        """Return a regression of values (n,) with errors (n,) on points (n, dim)."""
-        return GaussianProcess.fit(
-            point,
-            value[:, None],
-            noise=error,
-            num_categories=len(self.sizes),
-            settings=IN_CUBE,
-        )
 
     def spread(self, num: int, seed: int) -> Tensor:
         """Return points that fill the space, shape (num, dim): scrambled Sobol."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -15,7 +14,6 @@ from sbi_active.design.estimators.base import Bound
 from sbi_active.display.figures import legible
 from sbi_active.display.notebook import card, facts, items, table
 from sbi_active.display.table import Table, number
-from sbi_active.messages import warn
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -85,12 +83,6 @@ class Design:
         if self.cost is None:
             return self.expected_information_gain
         return self.expected_information_gain / self.cost
-
-    @cached_property  # not a property: designs that were stored have it as a field
-    def name(self) -> str:
-        """Former name of the label, where there is one."""
-        warn("SA701 Design.name goes in the next version: use labels", stacklevel=2)
-        return self.labels[0] if len(self.labels) == 1 else "action"
 
     @property
     def joint_information_gain(self) -> float:

@@ -3,34 +3,23 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any
 
 import torch
 from torch import Tensor
 from torch.distributions import Distribution
 
-from sbi_active.actions import ActionSpace
 from sbi_active.actions.discrete import Actions, action_space
 from sbi_active.design.design import Design
-from sbi_active.design.elimination import GainEvaluator, as_batch, eliminate
+from sbi_active.design.elimination import GainEvaluator, as_batch
 from sbi_active.design.estimators.automatic import by_name, find_estimator
-from sbi_active.design.estimators.base import (
-    InformationGainEstimator,
-    at_least,
-    standard_error,
-)
+from sbi_active.design.estimators.base import InformationGainEstimator, at_least
 from sbi_active.design.estimators.model_index import ModelIndexGain, RivalSampler
-from sbi_active.design.given import GivenGains
-from sbi_active.design.limits import DesignLimits, rows_of
+from sbi_active.design.given import design_given
+from sbi_active.design.limits import DesignLimits
 from sbi_active.design.sampler import CandidateSampler
-from sbi_active.design.search import (
-    Evaluations,
-    ExhaustiveSearch,
-    GradientSearch,
-    Objective,
-    Search,
-)
+from sbi_active.design.search import GradientSearch, Search
 from sbi_active.design.target import Target, target_estimator
 from sbi_active.expected import Shown, suggests
 from sbi_active.messages import warn
@@ -39,10 +28,7 @@ from sbi_active.simulation import MissingRowsWarning, Simulations
 from sbi_active.simulation.workers.settings import IN_PROCESS, Workers
 
 #: Name of a search: its class.
-SEARCHES: dict[str, type[Search]] = {
-    "exhaustive": ExhaustiveSearch,
-    "gradient": GradientSearch,
-}
+SEARCHES: dict[str, type[Search]] = {"gradient": GradientSearch}
 
 
 class InformationGainDesigner(Shown):
@@ -69,8 +55,8 @@ class InformationGainDesigner(Shown):
             first (entropies by nearest neighbors where x is one number, nested Monte
             Carlo where it is more), then the same with noise from replicates that pass
             a test of normality, else what the model can say.
-        search: A search; "exhaustive" or "gradient"; or "auto", exhaustive for lists,
-            else gradient.
+        search: Search of a space that is no list, of which all actions are compared:
+            an object, "gradient", or "auto", which is the same.
         eliminate: Start with half of the samples and spend the rest on the candidates
             still in reach of the leader; without it every candidate gets all of them.
         workers: Workers that run the simulations.
@@ -82,7 +68,7 @@ class InformationGainDesigner(Shown):
     Raises:
         ValueError: If ``num_samples`` is below 8, or the name of an estimator or a
             search is unknown.
-        TypeError: If the search does not apply to the action space.
+        TypeError: If parts of the space are neither boxes nor lists.
 
     Example:
         >>> from sbi_active import DiscreteActions, GaussianNoise, SimulatorModel
@@ -114,8 +100,13 @@ class InformationGainDesigner(Shown):
         self.num_samples = at_least(num_samples, 8, "num_samples", 1_000)
         self.actions = actions = action_space(actions)
         self.estimator, self.eliminate = estimator, eliminate
-        self.search = _find_search(search, actions)
-        self.search.size(actions)  # a search that does not apply is an error here
+        if isinstance(search, Search):
+            self.search = search
+        else:
+            name = "gradient" if search == "auto" else search
+            self.search: Search = by_name(name, "search", SEARCHES)
+        if actions.listed() is None:
+            self.search.size(actions)  # parts that it does not search are an error
         self.workers, self.most_numbers = workers, most_numbers
         find_estimator(estimator)  # an unknown name is an error here
 
@@ -128,9 +119,8 @@ class InformationGainDesigner(Shown):
         belief: Distribution | None = None,
         target: Target = "theta",
         simulations: Simulations | None = None,
-        cost: Callable[[Tensor], Tensor] | Tensor | None = None,
+        cost: Callable[[Tensor], Tensor] | None = None,
         constraint: Callable[[Tensor], Tensor] | None = None,
-        exclude: Tensor | None = None,
         pending: Tensor | None = None,
         min_probability_valid: float = 0.0,
         num_actions: int = 1,
@@ -158,12 +148,10 @@ class InformationGainDesigner(Shown):
             simulations: Rows under the belief, such as those that the model was trained
                 on; then nothing is simulated. Half of them choose and half report, but
                 where the model has seen them, both are too high.
-            cost: Cost of actions (n, action_dim), shape (n,), positive; or one number
-                an action of a list, shape (a,). The utility is information by cost.
+            cost: Cost of actions (n, action_dim), shape (n,), positive. The utility is
+                information by cost.
             constraint: Function of actions (n, action_dim) that says which are
                 permitted, shape (n,), bool.
-            exclude: Actions not to repeat, shape (t, action_dim); in a box nor others
-                within a hundredth of its width.
             pending: Actions under way, shape (p, action_dim), whose outcomes will be
                 known: what counts is the information beyond them.
             min_probability_valid: Candidates that give a measurement less often, by
@@ -187,49 +175,51 @@ class InformationGainDesigner(Shown):
                 enough.
         """
         at_least(num_actions, 1, "num_actions", 1)
-        others = rows_of(self.actions, pending, "pending")
-        allowed = constraint, exclude, cost, min_probability_valid
-        limits = DesignLimits(self.actions, *allowed)
+        dim = self.actions.action_dim
+        others = torch.empty(0, dim) if pending is None else pending.reshape(-1, dim)
+        limits = DesignLimits(self.actions, constraint, cost, min_probability_valid)
         belief = getattr(model, "belief", None) if belief is None else belief
         seed = int(torch.randint(2**62, ())) if seed is None else seed
         num_others = len(others) + num_actions - 1
         estimator = target_estimator(
             target, self.estimator, model, simulator, belief, simulations, num_others
         )
+        learns = estimator is not None and estimator.needs_model
         if simulations is not None:
-            rows = GivenGains(simulations, estimator, model, belief, limits, seed)
-            return rows.design(self.search)
-
-        def evaluator(probed: Tensor, others: Tensor, seed: int) -> GainEvaluator:
-            if target == "model":
-                rivals = RivalSampler(model, seed)
-                return GainEvaluator(rivals, ModelIndexGain(rivals.probability), model)
-            assert simulator is not None
-            assert belief is not None
-            # A model was learned from whole outcomes.
-            learns = estimator is not None and estimator.needs_model
-            sampler = CandidateSampler(
-                simulator,
-                belief,
-                probed,
-                seed,
-                self.workers,
-                others,
-                most_numbers=math.inf if learns else self.most_numbers,
-                replicates=estimator is None or estimator.needs_noise,
-            )
-            return GainEvaluator(sampler, estimator, model, belief)
-
+            return design_given(simulations, estimator, model, belief, limits, seed)
         listed, notes = limits.listed()
         budget = self._budget(budget, listed)
         steps: list[Design] = []
         for k in range(num_actions):
             own = derive_seed(seed, "action", k) if k else seed
-            probed = listed
-            if probed is None:
-                probed = self.actions.sample((16,), seed=derive_seed(own, "probed"))
-            gains = evaluator(probed, others, own)
-            steps.append(self._selected(gains, limits, budget, own, notes))
+            if target == "model":
+                sampler = RivalSampler(model, own)
+                estimator = ModelIndexGain(sampler.probability)
+            else:
+                probed = listed
+                if probed is None:
+                    probed = self.actions.sample((16,), seed=derive_seed(own, "probed"))
+                assert simulator is not None
+                assert belief is not None
+                sampler = CandidateSampler(
+                    *(simulator, belief, probed, own, self.workers, others),
+                    # A model was learned from whole outcomes.
+                    most_numbers=math.inf if learns else self.most_numbers,
+                    replicates=estimator is None or estimator.needs_noise,
+                )
+            gains = GainEvaluator(sampler, estimator, model, belief, limits, own)
+            finalists = listed
+            if finalists is None:
+                objective = gains.objective(self.search, budget, self.num_samples)
+                finalists = self.search.finalists(objective)
+            steps.append(
+                gains.eliminate(
+                    *(finalists, budget),
+                    num_samples=self.num_samples,
+                    share=0.5 if self.eliminate else 1.0,
+                    notes=notes,
+                )
+            )
             others = torch.cat([others, steps[-1].action[None]])
         design = as_batch(steps)
         if design.num_missing:
@@ -256,57 +246,3 @@ class InformationGainDesigner(Shown):
                 "allow more simulations or fewer candidates"
             )
         return budget
-
-    def _selected(
-        self,
-        evaluator: GainEvaluator,
-        limits: DesignLimits,
-        budget: int,
-        seed: int,
-        notes: Sequence[str],
-        *,
-        search_share: int = 12,
-    ) -> Design:
-        """Return the design of one action.
-
-        An action that a search evaluates gets one of so many shares of ``num_samples``.
-        """
-        num_samples = max(8, self.num_samples // search_share // 4 * 4)
-
-        def evaluate(action: Tensor) -> Evaluations:
-            """Estimate the utility, at the same parameters from call to call."""
-            evaluator.sampler.rewind()
-            drawn = evaluator.draw(num_samples, action)
-            gain, cost = evaluator(drawn), limits.cost(action)
-            valid, counted = drawn.num_valid()
-            error = torch.stack([standard_error(row) for row in gain])
-            return Evaluations(
-                action, gain.nanmean(1) / cost, error / cost, valid / counted.double()
-            )
-
-        objective = Objective(
-            actions=self.actions,
-            permitted=limits,
-            evaluate=evaluate,
-            num_evaluations=self.search.num_evaluations(budget, num_samples),
-            seed=derive_seed(seed, "search"),
-            min_probability_valid=limits.least,
-        )
-        return eliminate(
-            evaluator,
-            limits,
-            self.search.finalists(objective),
-            budget,
-            num_samples=self.num_samples,
-            share=0.5 if self.eliminate else 1.0,
-            seed=seed,
-            notes=notes,
-        )
-
-
-def _find_search(search: str | Search, actions: ActionSpace) -> Search:
-    if isinstance(search, Search):
-        return search
-    if search == "auto":
-        search = "gradient" if actions.listed() is None else "exhaustive"
-    return by_name(search, "search", SEARCHES, {"bayesopt": "gradient"})

@@ -13,7 +13,6 @@ from torch.distributions import Distribution
 from sbi_active.design.design import Design, action_labels
 from sbi_active.design.estimators.automatic import choose_estimator, disagreements
 from sbi_active.design.estimators.base import (
-    Bound,
     CandidateSimulations,
     InformationGainEstimator,
     standard_error,
@@ -22,6 +21,7 @@ from sbi_active.design.estimators.model_index import RivalSampler
 from sbi_active.design.limits import DesignLimits
 from sbi_active.design.outcomes import JointLikelihood, conditional_gain
 from sbi_active.design.sampler import CandidateSampler
+from sbi_active.design.search import Evaluations, Objective, Search
 from sbi_active.seeding import derive_seed
 from sbi_active.threads import single_thread
 
@@ -109,48 +109,40 @@ def paired_errors(contributions: Sequence[Tensor], chosen: int) -> Tensor:
     )
 
 
+@dataclass
 class GainEvaluator:
-    """Draws outcomes of candidates and estimates what these tell.
-
-    Args:
-        sampler: Sampler of the outcomes.
-        estimator: Estimator of the information; None is chosen by the first
-            simulations.
-        model: Model that the estimator needs.
-        belief: Distribution of the parameters; None for rivals.
+    """Draws outcomes of candidates, estimates what these tell, and chooses one.
 
     Attributes:
-        notes: Notes on failed checks of the estimator, or why others were not taken.
+        sampler: Sampler of the outcomes.
+        chosen: Estimator of the information; None is chosen by the first simulations.
+        model: Model that the estimator needs.
+        belief: Distribution of the parameters; None for rivals.
+        limits: Limits and costs of the actions.
+        seed: Seed of the search, and of the draws behind probabilities.
+        notes: Notes on failed checks of the estimator, or why others were not taken;
+            None before the first simulations.
     """
 
-    def __init__(
-        self,
-        sampler: CandidateSampler | RivalSampler,
-        estimator: InformationGainEstimator | None,
-        model: Any,
-        belief: Distribution | None = None,
-    ) -> None:
-        self.sampler, self.belief = sampler, belief
-        self.num_others = len(sampler.others)
-        if self.num_others and model is not None:
-            model = JointLikelihood(model, sampler.others.shape[1])
-        self.model: Any = model
-        self._chosen, self._is_settled = estimator, False
-        self.notes: list[str] = []
+    sampler: CandidateSampler | RivalSampler
+    chosen: InformationGainEstimator | None
+    model: Any
+    belief: Distribution | None
+    limits: DesignLimits
+    seed: int
+    notes: list[str] | None = None
+
+    def __post_init__(self) -> None:
+        self.num_others = len(self.sampler.others)
+        if self.num_others:  # of joint outcomes nothing else says anything
+            joint = JointLikelihood(self.model, self.sampler.others.shape[1])
+            self.model = joint if hasattr(self.model, "log_likelihood") else None
 
     @property
     def estimator(self) -> InformationGainEstimator:
         """The estimator given, or the one chosen by the first simulations."""
-        assert self._chosen is not None
-        return self._chosen
-
-    @property
-    def bound(self) -> Bound:
-        """Side of the information that the estimates lie on.
-
-        A difference of two bounds is none.
-        """
-        return "none" if self.num_others else self.estimator.bound_on(self.model)
+        assert self.chosen is not None
+        return self.chosen
 
     def draw(
         self, num_samples: int, action: Tensor, *, halves: bool = False
@@ -164,23 +156,25 @@ class GainEvaluator:
         """
         sampler = self.sampler
         drawn = sampler.draw(num_samples, action)
-        if self._is_settled:
+        if self.notes is not None:
             return drawn
-        self._is_settled = True
-        if self._chosen is not None:
-            chosen = self._chosen
-            self.notes = [*chosen.problems(drawn), *chosen.doubts(drawn)]
+        if self.chosen is None:
+            num_rows = num_samples // 2 if halves else num_samples
+            self.chosen, self.notes = choose_estimator(
+                self.model, drawn, self.belief, num_rows=num_rows
+            )
+            # A model was learned from whole outcomes.
+            if sampler.summaries is not None and self.chosen.needs_model:
+                sampler.summaries = None
+                sampler.rewind()
+                return sampler.draw(num_samples, action)
+        else:
+            self.notes = self.chosen.problems(drawn)
+        if not self.chosen.needs_slopes(drawn):
             return drawn
-        num_rows = num_samples // 2 if halves else num_samples
-        self._chosen, self.notes = choose_estimator(
-            self.model, drawn, num_rows=num_rows
-        )
-        # A model was learned from whole outcomes.
-        if sampler.summaries is not None and self._chosen.needs_model:
-            sampler.summaries = None
-            sampler.rewind()
-            return sampler.draw(num_samples, action)
-        return drawn
+        assert isinstance(sampler, CandidateSampler)
+        sampler.has_slopes = True
+        return sampler.add_slopes(drawn)
 
     def __call__(self, simulations: CandidateSimulations) -> Tensor:
         """Return contributions, shape (a, n), nats."""
@@ -190,104 +184,137 @@ class GainEvaluator:
                 return conditional_gain(self.estimator, *given, self.num_others)
             return self.estimator(*given)
 
-    def disagreements(
-        self, simulations: CandidateSimulations, gain: Tensor
+    def objective(
+        self, search: Search, budget: int, num_samples: int, *, share: int = 12
+    ) -> Objective:
+        """Return what a search maximizes, estimated at the same parameters.
+
+        Args:
+            search: Search that maximizes it.
+            budget: Simulations of the design.
+            num_samples: Simulations a candidate on average.
+            share: An evaluation has one of so many shares of these; of a fourth as many
+                its errors are twice as large.
+        """
+        num = max(8, num_samples // share // 4 * 4)
+
+        def evaluate(action: Tensor) -> Evaluations:
+            self.sampler.rewind()
+            drawn = self.draw(num, action)
+            gain, cost = self(drawn), self.limits.cost(action)
+            valid, counted = drawn.num_valid()
+            error = torch.stack([standard_error(row) for row in gain])
+            return Evaluations(
+                action, gain.nanmean(1) / cost, error / cost, valid / counted.double()
+            )
+
+        return Objective(
+            actions=self.limits.actions,
+            permitted=self.limits,
+            evaluate=evaluate,
+            num_evaluations=search.num_evaluations(budget, num),
+            seed=derive_seed(self.seed, "search"),
+            min_probability_valid=self.limits.least,
+        )
+
+    def eliminate(
+        self,
+        action: Tensor,
+        budget: int,
+        *,
+        num_samples: int,
+        share: float,
+        notes: Sequence[str] = (),
+        most: int = 4,
+    ) -> Design:
+        """Simulate candidates until one leads, in ever smaller groups; return it.
+
+        Args:
+            action: Candidates, shape (a, action_dim).
+            budget: Simulations in all, those so far included.
+            num_samples: Simulations a candidate on average.
+            share: Share of these that every candidate gets at first.
+            notes: Notes on the candidates, the last of the design's.
+            most: Times ``num_samples`` that a candidate may get at most.
+        """
+        sampler, limits, num_actions = self.sampler, self.limits, len(action)
+
+        def affordable(num: int, num_candidates: int) -> int:
+            each = (budget - sampler.num_drawn) // (num_candidates + self.num_others)
+            return min(num, each // 4 * 4)
+
+        size = affordable(max(8, int(share * num_samples)) // 4 * 4, num_actions)
+        first = self.draw(size, action, halves=True)
+        said = [*(self.notes or ()), *self.estimator.remarks(first)]
+        halves = _halves(first)
+        num_valid, num_counted = first.num_valid()
+        eligible = limits.reached_by(num_valid / num_counted)
+        said += limits.excluded_note(eligible)
+        cost = limits.cost(action)
+        weight = cost.mean() / cost
+        gains = [[torch.empty(0)] * num_actions for _ in range(2)]
+
+        def estimate(index: Tensor, halves: list[CandidateSimulations]) -> None:
+            for half, gain in zip(halves, gains, strict=True):
+                for a, row in zip(index.tolist(), self(half), strict=True):
+                    gain[a] = row
+
+        active, excluded = (torch.nonzero(e)[:, 0] for e in (eligible, ~eligible))
+        if len(excluded):  # estimated once, never chosen
+            estimate(excluded, [half.candidates(excluded) for half in halves])
+            halves = [half.candidates(active) for half in halves]
+        runs = len(first.outcomes())
+        while True:
+            estimate(active, halves)
+            race = Race.run([weight[a] * gains[0][a] for a in active], self.seed)
+            keep = race.in_reach
+            spent = 2 * len(halves[0].theta) * runs
+            more = affordable(min(spent, most * num_samples - spent), int(keep.sum()))
+            stopped = race.reason() or ("budget spent" if more < 8 else None)
+            if stopped is not None:
+                break
+            active = active[keep]
+            drawn = self.draw(more, action[active])
+            counts = (num_valid, num_counted), drawn.num_valid()
+            for count, new in zip(*counts, strict=True):
+                count[active] += new
+            halves = [
+                half.candidates(keep).join(new)
+                for half, new in zip(halves, _halves(drawn), strict=True)
+            ]
+        return choose(
+            limits,
+            action=action,
+            halves=gains,
+            eligible=eligible,
+            leader=int(active[race.leader]),
+            seed=self.seed,
+            probability_valid=num_valid / num_counted.double(),
+            runs=runs,
+            estimator=type(self.estimator).__name__,
+            # A difference of two bounds is none.
+            bound="none" if self.num_others else self.estimator.bound_on(self.model),
+            num_simulations=sampler.num_drawn,
+            num_missing=sampler.num_missing,
+            stopped=stopped,
+            notes=(
+                *said,
+                *self._cautions(halves[0], [gains[0][a] for a in active]),
+                *sampler.notes,
+                *notes,
+            ),
+        )
+
+    def _cautions(
+        self, simulations: CandidateSimulations, gain: list[Tensor]
     ) -> list[str]:
-        """Return the disagreements of other estimators, see :func:`.disagreements`."""
+        """Return cautions about the contributions of the last candidates."""
         if self.num_others:
-            return self.estimator.cautions(gain)
+            return self.estimator.cautions(torch.stack(gain))
         model = self.model if self.sampler.summaries is None else None
+        given = model, simulations, self.belief
         with single_thread():
-            return disagreements(self.estimator, model, simulations, self.belief, gain)
-
-
-def eliminate(
-    evaluator: GainEvaluator,
-    limits: DesignLimits,
-    action: Tensor,
-    budget: int,
-    *,
-    num_samples: int,
-    share: float,
-    seed: int,
-    notes: Sequence[str] = (),
-    most: int = 4,
-) -> Design:
-    """Simulate candidates until one leads, in ever smaller groups; return it.
-
-    Args:
-        evaluator: Evaluator that simulates and estimates.
-        limits: Limits and costs of the actions.
-        action: Candidates, shape (a, action_dim).
-        budget: Simulations in all, those of the evaluator so far included.
-        num_samples: Simulations a candidate on average.
-        share: Share of these that every candidate gets at first.
-        seed: Seed of the draws behind probabilities.
-        notes: Notes on the candidates, the last of the design's.
-        most: Times ``num_samples`` that a candidate may get at most.
-    """
-    sampler, num_actions = evaluator.sampler, len(action)
-
-    def affordable(num: int, num_candidates: int) -> int:
-        each = (budget - sampler.num_drawn) // (num_candidates + evaluator.num_others)
-        return min(num, each // 4 * 4)
-
-    size = affordable(max(8, int(share * num_samples)) // 4 * 4, num_actions)
-    first = evaluator.draw(size, action, halves=True)
-    said = [*evaluator.notes, *evaluator.estimator.remarks(first)]
-    halves = _halves(first)
-    num_valid, num_counted = first.num_valid()
-    eligible = limits.reached_by(num_valid / num_counted)
-    said += limits.excluded_note(eligible)
-    cost = limits.cost(action)
-    weight = cost.mean() / cost
-    gains = [[torch.empty(0)] * num_actions for _ in range(2)]
-
-    def estimate(index: Tensor, halves: list[CandidateSimulations]) -> None:
-        for half, gain in zip(halves, gains, strict=True):
-            for a, row in zip(index.tolist(), evaluator(half), strict=True):
-                gain[a] = row
-
-    active, excluded = (torch.nonzero(e)[:, 0] for e in (eligible, ~eligible))
-    if len(excluded):  # estimated once, never chosen
-        estimate(excluded, [half.candidates(excluded) for half in halves])
-        halves = [half.candidates(active) for half in halves]
-    runs = len(first.outcomes())
-    while True:
-        estimate(active, halves)
-        race = Race.run([weight[a] * gains[0][a] for a in active], seed)
-        keep = race.in_reach
-        spent = 2 * len(halves[0].theta) * runs
-        more = affordable(min(spent, most * num_samples - spent), int(keep.sum()))
-        stopped = race.reason() or ("budget spent" if more < 8 else None)
-        if stopped is not None:
-            break
-        active = active[keep]
-        drawn = evaluator.draw(more, action[active])
-        for count, new in zip((num_valid, num_counted), drawn.num_valid(), strict=True):
-            count[active] += new
-        halves = [
-            half.candidates(keep).join(new)
-            for half, new in zip(halves, _halves(drawn), strict=True)
-        ]
-    contributions = torch.stack([gains[0][a] for a in active])
-    said += evaluator.disagreements(halves[0], contributions)
-    return choose(
-        limits,
-        action=action,
-        halves=gains,
-        eligible=eligible,
-        leader=int(active[race.leader]),
-        seed=seed,
-        probability_valid=num_valid / num_counted.double(),
-        runs=runs,
-        estimator=type(evaluator.estimator).__name__,
-        bound=evaluator.bound,
-        num_simulations=sampler.num_drawn,
-        num_missing=sampler.num_missing,
-        stopped=stopped,
-        notes=(*said, *sampler.notes, *notes),
-    )
+            return disagreements(self.estimator, *given, torch.stack(gain))
 
 
 def _halves(simulations: CandidateSimulations) -> list[CandidateSimulations]:

@@ -10,12 +10,12 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from sbi_active.actions import ActionSpace, BoxActions
+from sbi_active.actions import ActionSpace
 from sbi_active.simulation.conditions import parameters_of
 
-#: Cost of actions (n, action_dim), shape (n,); a function of these and of the action
-#: executed before, or of these alone, or one number an action of a list.
-Cost = Callable[..., Tensor] | Tensor
+#: Cost of actions (n, action_dim), shape (n,), by these and the action executed before,
+#: or by these alone.
+Cost = Callable[..., Tensor]
 
 
 class DesignLimits:
@@ -25,34 +25,24 @@ class DesignLimits:
         actions: The space.
         constraint: Function of actions (n, action_dim) that says which are permitted,
             shape (n,), bool; None permits all.
-        exclude: Actions that are not to be repeated, shape (t, action_dim); in a box
-            nor others within a hundredth of its width in every entry.
         price: Cost of actions (n, action_dim), shape (n,), which may depend on the
-            action executed before, ``price(action, previous)``; or one number for each
-            action of a list, shape (a,); None for none.
+            action executed before, ``price(action, previous)``; None for none.
         least: Share of measurements that a choice needs.
 
     Attributes:
         is_sequential: Whether the cost depends on the action executed before.
         previous: That action, shape (action_dim,); None before any.
         left: Largest cost of an action.
-
-    Raises:
-        ValueError: If excluded actions or a list of costs have another shape.
     """
 
     def __init__(
         self,
         actions: ActionSpace,
         constraint: Callable[[Tensor], Tensor] | None = None,
-        exclude: Tensor | None = None,
         price: Cost | None = None,
         least: float = 0.0,
     ) -> None:
         self.actions, self.constraint, self.least = actions, constraint, least
-        self.exclude = rows_of(actions, exclude, "exclude")
-        if price is not None and not callable(price):
-            price = _listed_cost(torch.as_tensor(price), actions)
         self._price: Any = price
         self.is_sequential = _takes_previous(price)
         self.previous: Tensor | None = None
@@ -91,9 +81,6 @@ class DesignLimits:
             inside = inside & answer.bool()
         if self.left < math.inf:
             inside = inside & (self.cost(action) <= self.left)
-        if len(self.exclude):
-            offset = (action[:, None].float() - self.exclude).abs()
-            inside = inside & ~(offset <= self._tolerance()).all(-1).any(1)
         return inside
 
     def listed(self) -> tuple[Tensor | None, tuple[str, ...]]:
@@ -109,7 +96,7 @@ class DesignLimits:
         if not bool(inside.any()):
             raise ValueError(
                 f"expected a permitted action; got none of {len(values)}; loosen "
-                "constraint= or exclude="
+                "constraint="
             )
         out = int((~inside).sum())
         note = f"{out} of {len(values)} candidates not permitted"
@@ -174,45 +161,9 @@ class DesignLimits:
         )
         return (note,) if num else ()
 
-    def _tolerance(self, same: float = 0.01) -> Tensor:
-        """Return differences within which two actions are the same, (action_dim,)."""
-        parts = [
-            same * (part.high - part.low)
-            if isinstance(part, BoxActions)
-            else torch.full((part.action_dim,), 1e-6)
-            for part in self.actions.parts()
-        ]
-        return torch.cat(parts)
-
 
 def _takes_previous(price: Any) -> bool:
     """Whether a cost has an argument ``previous``, or needs a second one."""
     own = [p for p in parameters_of(price) if p.kind < p.VAR_POSITIONAL]
     needed = [p for p in own if p.default is p.empty]
     return len(needed) > 1 or "previous" in [p.name for p in own]
-
-
-def _listed_cost(table: Tensor, actions: ActionSpace) -> Callable[[Tensor], Tensor]:
-    values = actions.listed()
-    if values is None or table.shape != (len(values),):
-        raise ValueError(
-            "expected a cost of shape (a,), one number an action of a list; got "
-            f"shape {tuple(table.shape)} for {actions!r}; pass a function of "
-            "actions (n, action_dim)"
-        )
-    return lambda action: table[torch.cdist(action, values).argmin(1)]
-
-
-def rows_of(actions: ActionSpace, given: Tensor | None, name: str) -> Tensor:
-    """Return actions as rows (t, action_dim); none for None."""
-    dim = actions.action_dim
-    if given is None:
-        return torch.empty(0, dim)
-    rows = torch.as_tensor(given, dtype=torch.float32)
-    rows = rows[None] if rows.shape == (dim,) else rows
-    if rows.ndim != 2 or rows.shape[1] != dim:
-        raise ValueError(
-            f"expected {name} of shape (t, {dim}); got {tuple(rows.shape)}; give "
-            "one row an action"
-        )
-    return rows

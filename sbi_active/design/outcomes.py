@@ -93,16 +93,7 @@ class JointLikelihood:
         """Whether the likelihood of one outcome is exact."""
         return getattr(self.model, "exact_likelihood", False)
 
-    def __getattr__(self, name: str) -> Any:
-        if name == "log_likelihood" and hasattr(self.model, name):
-            return self._log_likelihood
-        raise AttributeError(
-            f"expected an estimator by the noise or by log_likelihood, which joint "
-            f"outcomes of several actions have; got one that asks for {name}; use "
-            "estimator='auto', or choose one action at a time without pending ones"
-        )
-
-    def _log_likelihood(self, x: Tensor, theta: Tensor, action: Tensor) -> Tensor:
+    def log_likelihood(self, x: Tensor, theta: Tensor, action: Tensor) -> Tensor:
         """Return log densities, shape (n,), of x (n, k, *x_shape), action (n, k d)."""
         actions = action.split(self.action_dim, 1)
         terms = [

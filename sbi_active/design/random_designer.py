@@ -35,7 +35,6 @@ class RandomDesigner(Shown):
         *,
         belief: Distribution | None = None,
         constraint: Callable[[Tensor], Tensor] | None = None,
-        exclude: Tensor | None = None,
         seed: int | None = None,
     ) -> Design:
         """Return a random action; nothing is simulated.
@@ -47,8 +46,6 @@ class RandomDesigner(Shown):
             belief: Belief, which is not used.
             constraint: Function of actions (n, action_dim) that says which are
                 permitted, shape (n,), bool.
-            exclude: Actions not to repeat, shape (t, action_dim); in a box nor others
-                within a hundredth of its width.
             seed: Seed of the choice; None draws one from torch's global generator.
 
         Returns:
@@ -57,7 +54,7 @@ class RandomDesigner(Shown):
         Raises:
             ValueError: If no action is permitted.
         """
-        limits = DesignLimits(self.actions, constraint, exclude)
+        limits = DesignLimits(self.actions, constraint)
         candidates, notes = limits.listed()
         if candidates is None:
             own = None if seed is None else derive_seed(seed, "candidates")

@@ -1,4 +1,4 @@
-"""Searches of an action space: all of a list, or where a regression is largest."""
+"""Searches of an action space for where a regression of the utility is largest."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from sbi_active.actions import ActionSpace
 from sbi_active.arrays import Array
 from sbi_active.design.coordinates import Coordinates
 from sbi_active.expected import Shown, require_least
-from sbi_active.inference.sampling.gaussian_process import GaussianProcess
+from sbi_active.inference.sampling.gaussian_process import IN_CUBE, GaussianProcess
 from sbi_active.seeding import derive_seed
 
 Score = Callable[[Tensor], Tensor]
@@ -82,15 +82,11 @@ class Objective:
 
 
 class Search(Shown, ABC):
-    """Find the actions that deserve an estimate on many simulations."""
+    """Find the actions that deserve an estimate, in a space that is no list."""
 
     @abstractmethod
     def size(self, actions: ActionSpace) -> int:
-        """Return the simulations of a design, in those of one candidate.
-
-        Raises:
-            TypeError: If the search does not apply to the space.
-        """
+        """Return the simulations of a design, in those of one candidate."""
 
     def num_evaluations(self, budget: int, num_samples: int) -> int:
         """Return the number of actions to evaluate on the way, 0 by default.
@@ -107,30 +103,6 @@ class Search(Shown, ABC):
     @abstractmethod
     def finalists(self, objective: Objective) -> Tensor:
         """Return actions, shape (a, action_dim), the best of which is then chosen."""
-
-
-class ExhaustiveSearch(Search):
-    """Compare all actions of a list on common random numbers (:func:`.eliminate`)."""
-
-    @override
-    def size(self, actions: ActionSpace) -> int:
-        return len(self._listed(actions))
-
-    @override
-    def finalists(self, objective: Objective) -> Tensor:
-        values = self._listed(objective.actions)
-        return values[objective.permitted(values)]
-
-    @staticmethod
-    def _listed(actions: ActionSpace) -> Tensor:
-        values = actions.listed()
-        if values is None:
-            raise TypeError(
-                f"expected DiscreteActions; got {type(actions).__name__}, of which "
-                "there is no end; list the candidates, DiscreteActions(values), or use "
-                "search='gradient'"
-            )
-        return values
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -188,11 +160,6 @@ class GradientSearch(Search):
 
     @override
     def size(self, actions: ActionSpace) -> int:
-        if actions.listed() is not None:
-            raise TypeError(
-                f"expected BoxActions or MixedActions with a box; got {actions!r}, a "
-                "list; use search='exhaustive'"
-            )
         space = Coordinates(actions)
         categories = sum(size - 1 for size in space.sizes)
         return self.each * (1 + space.num_continuous + categories)
@@ -258,7 +225,13 @@ class GradientSearch(Search):
         lacking = (least - found.probability_valid).clamp_min(0.0)
         value = found.utility - self.penalty * found.utility.std() * lacking
         known = space.points(found.action)
-        utility = space.regression(known, value, found.standard_error)
+        utility = GaussianProcess.fit(
+            known,
+            value[:, None],
+            noise=found.standard_error,
+            num_categories=len(space.sizes),
+            settings=IN_CUBE,
+        )
 
         def score(z: Tensor) -> Tensor:
             mean, variance = utility(z)

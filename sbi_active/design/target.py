@@ -51,19 +51,14 @@ def target_estimator(
     Raises:
         ValueError: If what the target or the estimator needs is lacking.
     """
-    own = ("auto",) if target == "model" else ("auto", "linear")
-    if target != "theta" and given not in own:
-        raise ValueError(
-            f"expected estimator={' or '.join(map(repr, own))} for "
-            f"target={name_of(target)!r}; got {given!r}; leave out estimator="
-        )
     if target == "model":
-        if not isinstance(model, Sequence) or simulations is not None or num_others:
+        fits = isinstance(model, Sequence) and simulations is None
+        if given != "auto" or num_others or not fits:
             raise ValueError(
-                "expected a sequence of rivals, no simulations= and one action at a "
-                f"time for target='model'; got {type(model).__name__} and {num_others} "
-                "others; pass objects with probability and "
-                "predict(action, num_samples, seed)"
+                "expected estimator='auto', a sequence of rivals, no simulations= and "
+                f"one action at a time for target='model'; got {given!r}, "
+                f"{type(model).__name__} and {num_others} others; pass objects with "
+                "probability and predict(action, num_samples, seed)"
             )
         return None
     if belief is None or (simulator is None and simulations is None):
@@ -77,47 +72,47 @@ def target_estimator(
             "expected one action and none pending with simulations=, rows of single "
             f"outcomes; got {num_others} others; leave out simulations="
         )
-    if target != "theta":
-        is_linear = given == "linear"
-        if not callable(target):
-            index = places(target, simulator)
-            return LinearGain(index) if is_linear else ParameterGain(index)
-        quantity = Quantity(target, simulator, belief)
-        if is_linear:
-            return LinearGain(quantity)
-        return ParameterGain(quantity, num_marginal=quantity.num_draws)
-    estimator = find_estimator(given)
-    if estimator is None or not estimator.needs_model:
+    if target == "theta":
+        estimator = find_estimator(given)
+        lacks = model is None or num_others and not hasattr(model, "log_likelihood")
+        if estimator is not None and estimator.needs_model and lacks:
+            raise ValueError(
+                f"expected a model for {type(estimator).__name__}, with log_likelihood "
+                f"if several actions are to tell together; got {type(model).__name__}; "
+                "pass the trained posterior, or estimator='auto'"
+            )
         return estimator
-    if model is None or (num_others and not hasattr(model, "log_likelihood")):
+    if given not in ("auto", "linear"):
         raise ValueError(
-            f"expected a model for {type(estimator).__name__}, with log_likelihood if "
-            f"several actions are to tell together; got {type(model).__name__}; pass "
-            "the trained posterior, or estimator='auto'"
+            f"expected estimator='auto' or 'linear' for target={name_of(target)!r}; "
+            f"got {given!r}; leave out estimator="
         )
-    return estimator
+    if callable(target):
+        quantity = Quantity(target, simulator, belief)
+        num = quantity.num_draws
+    else:
+        quantity, num = _named(target, simulator), 20_000
+    if given == "linear":
+        return LinearGain(quantity)
+    return ParameterGain(quantity, num_marginal=num)
 
 
-def places(names: str | Sequence[str], simulator: Any) -> list[int]:
-    """Return the places of parameters by name.
+def _named(names: str | Sequence[str], simulator: Any) -> Callable[[Tensor], Tensor]:
+    """Return a function that gives parameters by name, (n, d) -> (n, k).
 
     Raises:
-        ValueError: If the simulator has no names, or not these.
+        ValueError: If the simulator does not have them.
     """
-    known = getattr(simulator, "parameter_names", None)
-    if not known:
+    known = [*(getattr(simulator, "parameter_names", None) or ())]
+    wanted = [names] if isinstance(names, str) else [*names]
+    if not wanted or not {*wanted} <= {*known} or len({*wanted}) < len(wanted):
         raise ValueError(
-            f"expected a simulator with parameter_names for target={names!r}; got "
-            "none; build SimulatorModel(fn, parameter_names=[...])"
+            "expected target 'theta', 'model', a function, or different names among "
+            f"{known}, the simulator's parameter_names; got {names!r}; choose one or "
+            "more of these"
         )
-    wanted = [names] if isinstance(names, str) else list(names)
-    unknown = [name for name in wanted if name not in known]
-    if unknown or not wanted:
-        raise ValueError(
-            f"expected target 'theta', 'model', a function, or names among "
-            f"{list(known)}; got {names!r}; choose one or more of these"
-        )
-    return [list(known).index(name) for name in wanted]
+    index = [known.index(name) for name in wanted]
+    return lambda theta: theta[:, index]
 
 
 class Quantity:

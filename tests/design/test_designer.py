@@ -2,7 +2,6 @@ import pytest
 import torch
 
 from sbi_active import DiscreteActions, InformationGainDesigner
-from sbi_active.messages import RenamedWarning
 from sbi_active.simulation import GaussianNoise, SimulatorModel
 from sbi_active.tasks.numerical.exact import ExactPosterior
 from sbi_active.tasks.numerical.task import NumericalTask
@@ -26,6 +25,7 @@ def test_it_finds_the_action_that_tells_most():
     assert design.estimator == "PosteriorGain"
     assert design.stopped == "leader separated"
     assert design.notes == ()
+    assert design.labels == ("push [m/s]",)
     z = (design.expected_information_gain - information(VALUES[:, None])) / (
         design.standard_error
     )
@@ -33,14 +33,6 @@ def test_it_finds_the_action_that_tells_most():
     assert design.probability_best.sum() == pytest.approx(1.0)
     assert design.probability_best[3] > 0.99
     assert (design.probability_valid == 1).all()
-
-
-def test_the_former_name_of_a_design_warns():
-    designer = InformationGainDesigner(ACTIONS, num_samples=64, estimator="posterior")
-    design = designer.select(ExactModel(), simulator, seed=0)
-    assert design.labels == ("push [m/s]",)
-    with pytest.warns(RenamedWarning, match="use labels"):
-        assert design.name == "push [m/s]"
 
 
 def test_the_choice_and_the_report_use_separate_simulations():

@@ -17,7 +17,7 @@ from tests.design.fragile import ACTIONS, NOISE, PRIOR, Fragile
 
 CERTAIN, LUCKY, LUCKIER = Fragile(0.0), Fragile(0.4), Fragile(1.5)
 BY_LUCK = {
-    True: [PosteriorGain(), ParameterGain([0])],
+    True: [PosteriorGain(), ParameterGain()],
     False: [PosteriorGain(), EntropyGain(), NestedGain()],
 }
 

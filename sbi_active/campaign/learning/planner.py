@@ -68,7 +68,7 @@ class Planner:
         require_nested(effects)
         self._state, self.effects = state, (*effects,)
         options = state.options
-        self._limits = DesignLimits(actions, constraint, None, cost)
+        self._limits = DesignLimits(actions, constraint, cost)
         # A wrong shape is an error here, and not in a later round.
         permitted(self._limits)
         listed = actions.listed()

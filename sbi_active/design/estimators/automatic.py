@@ -31,8 +31,12 @@ ESTIMATORS: dict[str, type[InformationGainEstimator]] = {
     "posterior": PosteriorGain,
     "ratio": RatioGain,
 }
-#: Former name of an estimator: the name of the one in its place.
-FORMER = {"contrastive": "info_nce", "variational_nested": "likelihood"}
+#: Former name of an estimator or a search: the name of the one in its place.
+FORMER = {
+    "bayesopt": "gradient",
+    "contrastive": "info_nce",
+    "variational_nested": "likelihood",
+}
 #: Numbers of x up to which nearest neighbors are trusted.
 MAX_NEIGHBOR_OUTCOMES = 2
 #: Parameters up to which local draws of nested Monte Carlo meet a posterior: of 40
@@ -53,31 +57,26 @@ def find_estimator(
     """
     if isinstance(estimator, InformationGainEstimator):
         return estimator
-    if estimator == "auto":
-        return None
-    return by_name(estimator, "estimator", ESTIMATORS, FORMER)
+    return None if estimator == "auto" else by_name(estimator, "estimator", ESTIMATORS)
 
 
-def by_name(
-    name: str, what: str, known: Mapping[str, type], former: Mapping[str, str]
-) -> Any:
-    """Return an object of the class of a name.
+def by_name(name: str, what: str, known: Mapping[str, type]) -> Any:
+    """Return an object of the class of a name, or of a former one.
 
     Args:
         name: Name that was given.
         what: Argument that takes it.
         known: Classes by name.
-        former: Names by those of the last version, which still work.
 
     Raises:
         ValueError: If the name is unknown; it lists the valid ones.
     """
-    if name in former:
+    if FORMER.get(name) in known:
         warn(
             f"SA701 {what}={name!r} goes in the next version: use "
-            f'{what}="{former[name]}", or "auto"',
+            f'{what}="{FORMER[name]}", or "auto"',
         )
-        name = former[name]
+        name = FORMER[name]
     if name not in known:
         raise ValueError(
             f"expected {what} among 'auto', {', '.join(map(repr, known))}; got "
@@ -87,7 +86,11 @@ def by_name(
 
 
 def choose_estimator(
-    model: Any, simulations: CandidateSimulations, *, num_rows: int | None = None
+    model: Any,
+    simulations: CandidateSimulations,
+    belief: Distribution | None,
+    *,
+    num_rows: int | None = None,
 ) -> tuple[InformationGainEstimator, list[str]]:
     """Return the first estimator whose assumptions pass their checks.
 
@@ -103,6 +106,7 @@ def choose_estimator(
     Args:
         model: Model that was learned, or None.
         simulations: Simulations to check assumptions by.
+        belief: Distribution of the parameters.
         num_rows: Fewest simulations of a candidate that an estimate will rest on; None
             are as many as these.
     """
@@ -110,17 +114,16 @@ def choose_estimator(
     declared = simulations.mean is not None and simulations.noise is not None
     by_noise, notes = None, []
     if declared or simulations.replicate is not None:
+        by_noise = NestedGain()
         if num_outcomes <= (1 if declared else MAX_NEIGHBOR_OUTCOMES):
             by_noise = EntropyGain()
-        else:
+        elif declared and simulations.theta.shape[1] > MAX_NESTED_PARAMETERS:
             linear = LinearGain(max_bent=MAX_BENT)
-            many = declared and simulations.theta.shape[1] > MAX_NESTED_PARAMETERS
-            if many and linear.suits(simulations, num_rows or len(simulations.theta)):
+            if linear.suits(simulations, num_rows or len(simulations.theta)):
                 return linear, []
-            by_noise = NestedGain()
         problems = by_noise.problems(simulations)
         if not problems:
-            return by_noise, by_noise.doubts(simulations)
+            return by_noise, []
         notes = [f"{type(by_noise).__name__} not used: {text}" for text in problems]
     if hasattr(model, "log_posterior"):
         return PosteriorGain(), notes
@@ -128,13 +131,13 @@ def choose_estimator(
         return LikelihoodGain(), notes
     if hasattr(model, "log_ratio"):
         bound, few = InfoNCEGain(), simulations.samples(slice(256))
-        cautions = bound.cautions(bound(model, few, None))
+        cautions = bound.cautions(bound(model, few, belief))
         if not cautions:
             return bound, notes
         return RatioGain(), [*notes, *(f"not used: {text}" for text in cautions)]
     assert by_noise is not None
     if bool(random_presence(simulations).any()):
-        return ParameterGain(range(simulations.theta.shape[1])), notes
+        return ParameterGain(), notes
     return by_noise, [*notes, "used all the same: there is no model"]
 
 
@@ -147,39 +150,33 @@ def disagreements(
     *,
     negligible: float = 0.3,
 ) -> list[str]:
-    """Return cautions about an estimate, which is compared with others that apply.
+    """Return cautions about an estimate, which is compared with a bound.
 
-    There is one short sentence for each disagreement, by the contributions (a, n):
-    four standard errors beyond ``negligible`` nats.
+    That is the network's of an estimate without a bound, and InfoNCE of a ratio. There
+    is a sentence for a disagreement, by the contributions (a, n): four standard errors
+    beyond ``negligible`` nats.
     """
-    others: list[InformationGainEstimator] = []
-    num_outcomes = simulations.x[0, 0].numel()
-    if isinstance(estimator, NestedGain) and num_outcomes <= MAX_NEIGHBOR_OUTCOMES:
-        others.append(EntropyGain())
+    notes, other = estimator.cautions(gain), None
     # A model that is trained on demand is not trained for a note.
     at_hand = estimator.bound == "none" and getattr(model, "is_trained", True)
     if at_hand and hasattr(model, "log_posterior"):
-        others.append(PosteriorGain())
+        other = PosteriorGain()
     if isinstance(estimator, RatioGain):
-        others.append(InfoNCEGain())
-    notes = estimator.cautions(gain)
-    for other in others:
-        estimate = other(model, simulations, belief)
-        difference = estimate - gain
-        error = torch.stack([standard_error(row) for row in difference])
-        mean = difference.nanmean(1)
-        apart = mean.abs() > negligible + 4 * error
-        for a in torch.nonzero(apart)[:, 0].tolist():
-            apart[a] = not other.cautions(estimate[a : a + 1])
-        if not bool(apart.any()):
-            continue
+        other = InfoNCEGain()
+    if other is None:
+        return notes
+    estimate = other(model, simulations, belief)
+    difference = estimate - gain
+    error = torch.stack([standard_error(row) for row in difference])
+    mean = difference.nanmean(1)
+    apart = (mean.abs() > negligible + 4 * error) & (not other.cautions(estimate))
+    if bool(apart.any()):
         worst = int(torch.where(apart, mean.abs(), 0.0).argmax())
         side = "below" if float(mean[worst]) < 0 else "above"
-        blunt = other.bound == "lower" and side == "below"
+        blunt = " (a lower bound: the network is blunt)" if side == "below" else ""
         notes.append(
             f"{type(other).__name__} is {abs(float(mean[worst])):.1f} nats {side} at "
             f"action {simulations.action[worst].tolist()}, apart at "
-            f"{int(apart.sum())} of {len(apart)}"
-            + (" (a lower bound: the network is blunt)" if blunt else "")
+            f"{int(apart.sum())} of {len(apart)}{blunt}"
         )
     return notes

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
@@ -33,8 +32,9 @@ class CandidateSimulations:
             unlike outcomes without a measurement, whose NaN is information.
         sd: Standard deviations of the noise around the mean, as x, where rivals have
             noise of their own; else None.
-        each: Actions of the rows of one candidate, shape (n, action_dim), where every
-            row has its own; else None.
+        fisher: Information matrices of the simulator's own slopes, in units of the
+            noise, shape (a, n, theta_dim, theta_dim); NaN at most parameters, None for
+            none.
     """
 
     theta: Tensor
@@ -45,7 +45,7 @@ class CandidateSimulations:
     replicate: Tensor | None = None
     missing: Tensor | None = None
     sd: Tensor | None = None
-    each: Tensor | None = None
+    fisher: Tensor | None = None
 
     @property
     def counted(self) -> Tensor:
@@ -89,8 +89,6 @@ class CandidateSimulations:
 
     def rows(self) -> tuple[Tensor, Tensor]:
         """Return theta and action of every outcome in turn, a * n rows each."""
-        if self.each is not None:
-            return self.theta, self.each
         num_actions, num_samples = self.x.shape[:2]
         return (
             self.theta.repeat(num_actions, 1),
@@ -117,7 +115,7 @@ class CandidateSimulations:
         return replace(self, theta=torch.cat([self.theta, other.theta]), **parts)
 
     def _parts(self) -> dict[str, Tensor]:
-        names = ("x", "mean", "replicate", "missing", "sd")
+        names = ("x", "mean", "replicate", "missing", "sd", "fisher")
         parts = {name: getattr(self, name) for name in names}
         return {name: part for name, part in parts.items() if part is not None}
 
@@ -130,14 +128,11 @@ class InformationGainEstimator(Shown, ABC):
             the model.
         needs_noise: Whether it uses the declared noise, or else replicates.
         needs_model: Whether it uses something learned.
-        rowwise: Whether a contribution depends on its own row alone, as given by
-            :meth:`CandidateSimulations.rows`.
     """
 
     bound: Bound = "none"
     needs_noise: bool = False
     needs_model: bool = True
-    rowwise: bool = False
 
     def __call__(
         self,
@@ -201,9 +196,9 @@ class InformationGainEstimator(Shown, ABC):
         """Say in short sentences what speaks against the estimator here."""
         return []
 
-    def doubts(self, simulations: CandidateSimulations) -> list[str]:
-        """Say where estimates are off, though nothing else is likely to do better."""
-        return []
+    def needs_slopes(self, simulations: CandidateSimulations) -> bool:
+        """Return whether estimates need slopes of the simulator, see ``fisher``."""
+        return False
 
     def remarks(self, simulations: CandidateSimulations) -> list[str]:
         """Return remarks on an estimate from simulations."""
@@ -214,6 +209,15 @@ class InformationGainEstimator(Shown, ABC):
         self, model: Any, simulations: CandidateSimulations, belief: Any
     ) -> Tensor:
         """Return the contributions, shape (a, n)."""
+
+
+def noise_scale(simulations: CandidateSimulations) -> Tensor:
+    """Return the root mean square of declared noise, shape (a, numbers of x)."""
+    assert simulations.mean is not None
+    square = (simulations.x - simulations.mean).flatten(2).double().square()
+    finite = square.isfinite()
+    square = torch.where(finite, square, 0.0).sum(1) / finite.sum(1).clamp_min(1)
+    return torch.where(square > 0, square, 1.0).sqrt()
 
 
 def standard_error(contributions: Tensor) -> Tensor:
@@ -227,23 +231,3 @@ def at_least(value: int, least: int, name: str, usual: int) -> int:
     if value < least:
         raise ValueError(f"expected {name} >= {least}; got {value}; use about {usual}")
     return value
-
-
-def numbers_of(
-    target: Sequence[int] | Callable[[Tensor], Tensor],
-) -> Callable[[Tensor], Tensor]:
-    """Return a function of parameters (n, d) that gives those of some places, (n, k).
-
-    A function is returned as it is.
-
-    Raises:
-        ValueError: If there is no place, or one twice.
-    """
-    if callable(target):
-        return target
-    index = list(target)
-    if not index or len(set(index)) < len(index):
-        raise ValueError(
-            f"expected one or more different parameters; got {index}; name each once"
-        )
-    return lambda theta: theta[:, index]

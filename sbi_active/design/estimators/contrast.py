@@ -8,11 +8,11 @@ from __future__ import annotations
 
 import math
 import zlib
-from abc import abstractmethod
 from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
+from torch.distributions import Distribution
 from typing_extensions import override
 
 from sbi_active.design.estimators.base import (
@@ -35,13 +35,34 @@ class _Critic(InformationGainEstimator):
     functions: ClassVar[tuple[str, ...]] = ("log_ratio",)
     batch_size: int = 50_000
 
-    def _rows(self, model: Any, x: Tensor, theta: Tensor, action: Tensor) -> Tensor:
-        """Return f of x (n, *x_shape), theta (n, d) and action (n, k), shape (n,)."""
+    def _contributions(
+        self, model: Any, simulations: CandidateSimulations, belief: Any
+    ) -> Tensor:
+        gain = torch.full(simulations.x.shape[:2], torch.nan, dtype=torch.float64)
+        others = self._others(simulations, belief)
+        for a, counted in enumerate(simulations.counted):
+            rows, action = torch.nonzero(counted)[:, 0], simulations.action[a]
+            if len(rows):
+                theta = simulations.theta[rows]
+                of_each = [
+                    self._of_rows(model, x[a, rows], theta, others, action)
+                    for x in simulations.outcomes()
+                ]
+                gain[a, rows] = torch.stack(of_each).mean(0)
+        return gain
+
+    def _others(self, simulations: CandidateSimulations, belief: Any) -> Tensor:
+        """Return the parameters that outcomes are compared with, (m, d)."""
+        return simulations.theta[:0]
+
+    def _of_rows(
+        self, model: Any, x: Tensor, theta: Tensor, others: Tensor, action: Tensor
+    ) -> Tensor:
+        """Return contributions of outcomes (n, *x_shape) of one candidate, (n,)."""
         name = self._function(model)
-        parts = [p.split(self.batch_size) for p in _ordered(name, x, theta, action)]
-        batches = zip(*parts, strict=True)
-        values = [getattr(model, name)(*batch).double() for batch in batches]
-        return torch.cat(values)
+        rows = _ordered(name, x, theta, action.expand(len(x), -1))
+        batches = zip(*(part.split(self.batch_size) for part in rows), strict=True)
+        return torch.cat([getattr(model, name)(*batch).double() for batch in batches])
 
     def _table(self, model: Any, x: Tensor, theta: Tensor, action: Tensor) -> Tensor:
         """Return f of every x (n, ...) with every theta (m, d) at one action, (n, m).
@@ -54,8 +75,8 @@ class _Critic(InformationGainEstimator):
         if all_pairs is not None:
             return all_pairs(*_ordered(name, x, theta, action)).double()
         n, m = len(x), len(theta)
-        every = x.repeat_interleave(m, 0), theta.repeat(n, 1), action.expand(n * m, -1)
-        return self._rows(model, *every).reshape(n, m)
+        every = x.repeat_interleave(m, 0), theta.repeat(n, 1)
+        return _Critic._of_rows(self, model, *every, theta, action).reshape(n, m)
 
     def _function(self, model: Any) -> str:
         for name in self.functions:
@@ -97,95 +118,8 @@ class RatioGain(_Critic):
         Kleinegesse, Drovandi & Gutmann, Bayesian Analysis 2021 (the utility).
     """
 
-    rowwise = True
 
-    def _contributions(
-        self, model: Any, simulations: CandidateSimulations, belief: Any
-    ) -> Tensor:
-        theta, action = simulations.rows()
-        counted = simulations.counted.flatten()
-        gain = torch.full(counted.shape, torch.nan, dtype=torch.float64)
-        of_each = [
-            self._rows(model, x.flatten(0, 1)[counted], theta[counted], action[counted])
-            for x in simulations.outcomes()
-        ]
-        gain[counted] = torch.stack(of_each).mean(0)
-        return gain.reshape(simulations.x.shape[:2])
-
-
-class _Contrast(_Critic):
-    r"""Log of f at an outcome's own parameters, less its mean over others.
-
-    A contribution includes what parameters do to the evidence of outcomes that they are
-    compared with; this has mean zero and makes the error honest.
-
-    Attributes:
-        caution: Words where an estimate is near its limit, with {limit} and {where}.
-        num_contrastive: Number of parameters that each outcome is compared with.
-    """
-
-    caution: ClassVar[str]
-    num_contrastive: int
-
-    @abstractmethod
-    def _compared(
-        self, counted: Tensor, simulations: CandidateSimulations, belief: Any
-    ) -> list[tuple[Tensor, Tensor]]:
-        """Return groups of the counted rows (n,), and the parameters for each."""
-
-    @abstractmethod
-    def _limit(self, counted: Tensor) -> int:
-        """Return the number whose log the estimate from counted rows is limited by."""
-
-    def _contributions(
-        self, model: Any, simulations: CandidateSimulations, belief: Any
-    ) -> Tensor:
-        gain = torch.full(simulations.x.shape[:2], torch.nan, dtype=torch.float64)
-        for a, counted in enumerate(simulations.counted):
-            action = simulations.action[a]
-            for rows, others in self._compared(counted, simulations, belief):
-                theta = simulations.theta[rows]
-                of_each = [
-                    self._of_rows(model, x[a, rows], theta, others, action)
-                    for x in simulations.outcomes()
-                ]
-                gain[a, rows] = torch.stack(of_each).mean(0)
-        return gain
-
-    def _of_rows(
-        self, model: Any, x: Tensor, theta: Tensor, others: Tensor, action: Tensor
-    ) -> Tensor:
-        """Return contributions of outcomes of one candidate, shape (n,)."""
-        n, m = len(x), len(others)
-        own = self._rows(model, x, theta, action.expand(n, -1))
-        log_p = torch.empty(n, dtype=torch.float64)
-        share = torch.zeros(m, dtype=torch.float64)  # in the evidences of all outcomes
-        for block in torch.arange(n).split(max(64, self.batch_size // m)):
-            table = self._table(model, x[block], others, action)
-            log_p[block] = table.logsumexp(1) - math.log(m)
-            share += table.softmax(1).nan_to_num(0.0).sum(0)
-        effect = torch.zeros(n, dtype=torch.float64)
-        effect.index_add_(0, torch.arange(m) % n, share - share.mean())
-        return torch.where(own == -torch.inf, own, own - log_p) - effect
-
-    @override
-    def cautions(self, gain: Tensor, *, near: float = 1.0) -> list[str]:
-        """Return a caution where estimates are near their limit or above it.
-
-        Args:
-            gain: Contributions, shape (a, n).
-            near: Distance to the log of a number of draws, within which too few are
-                effective, nats.
-        """
-        limits = [math.log(max(1, self._limit(row.isfinite()))) for row in gain]
-        above = gain.nanmean(1) > torch.tensor(limits, dtype=gain.dtype) - near
-        if not bool(above.any()):
-            return []
-        where = f"{int(above.sum())} of {len(gain)} actions"
-        return [self.caution.format(limit=f"{max(limits):.1f} nats", where=where)]
-
-
-class LikelihoodGain(_Contrast):
+class LikelihoodGain(_Critic):
     r"""Nested Monte Carlo on a likelihood, the utility of ALHI.
 
     .. math::
@@ -236,10 +170,11 @@ class LikelihoodGain(_Contrast):
     """
 
     functions = ("log_likelihood",)
-    caution = (
+    caution: ClassVar[str] = (
         "LikelihoodGain is near log L = {limit} or above at {where}: few of the draws "
         "explain an outcome, and it is too large there; raise num_contrastive"
     )
+    own: ClassVar[int] = 0
 
     def __init__(self, *, num_contrastive: int = 500) -> None:
         self.num_contrastive = at_least(num_contrastive, 1, "num_contrastive", 100)
@@ -248,45 +183,72 @@ class LikelihoodGain(_Contrast):
     def bound_on(self, model: Any) -> Bound:
         return "upper" if getattr(model, "exact_likelihood", False) else "none"
 
-    def _limit(self, counted: Tensor) -> int:
-        return self.num_contrastive
-
-    def _compared(
-        self, counted: Tensor, simulations: CandidateSimulations, belief: Any
-    ) -> list[tuple[Tensor, Tensor]]:
+    @override
+    def _others(
+        self, simulations: CandidateSimulations, belief: Distribution | None
+    ) -> Tensor:
         if belief is None:
             raise ValueError(
                 f"expected a belief for {type(self).__name__} to draw from; got None; "
                 "pass the distribution of theta in the simulations"
             )
-        rows = torch.nonzero(counted)[:, 0]
         key = zlib.crc32(simulations.theta.numpy(force=True).tobytes())
         with forked_generators(derive_seed(0, "contrastive", key)):
-            others = belief.sample(torch.Size([self.num_contrastive]))
-        return [(rows, others)] if len(rows) else []
+            return belief.sample(torch.Size([self.num_contrastive]))
+
+    @override
+    def _of_rows(
+        self, model: Any, x: Tensor, theta: Tensor, others: Tensor, action: Tensor
+    ) -> Tensor:
+        """Return contributions, with what others do to the evidence of outcomes.
+
+        This has mean zero and makes the error honest.
+        """
+        n, m = len(x), len(others)
+        own = super()._of_rows(model, x, theta, others, action)
+        log_p = torch.empty(n, dtype=torch.float64)
+        share = torch.zeros(m, dtype=torch.float64)  # in the evidences of all outcomes
+        for block in torch.arange(n).split(max(64, self.batch_size // m)):
+            table = self._table(model, x[block], others, action)
+            if self.own:
+                table = torch.cat([table, own[block, None]], 1)
+            log_p[block] = table.logsumexp(1) - math.log(m + self.own)
+            share += table.softmax(1).nan_to_num(0.0)[:, :m].sum(0)
+        effect = torch.zeros(n, dtype=torch.float64)
+        effect.index_add_(0, torch.arange(m) % n, share - share.mean())
+        return torch.where(own == -torch.inf, own, own - log_p) - effect
+
+    @override
+    def cautions(self, gain: Tensor, *, near: float = 1.0) -> list[str]:
+        """Return a caution where estimates are near their limit or above it.
+
+        Args:
+            gain: Contributions, shape (a, n).
+            near: Distance to the log of a number of draws, within which too few are
+                effective, nats.
+        """
+        limit = math.log(self.num_contrastive + self.own)
+        above = int((gain.nanmean(1) > limit - near).sum())
+        where = f"{above} of {len(gain)} actions"
+        found = self.caution.format(limit=f"{limit:.1f} nats", where=where)
+        return [found] if above else []
 
 
-class InfoNCEGain(_Contrast):
+class InfoNCEGain(LikelihoodGain):
     r"""InfoNCE bound with a learned ratio or likelihood as its critic.
 
     .. math::
-        U(\xi) = \frac1K \sum_{i=1}^K \log \frac{e^{f(x_i, \theta_i | \xi)}}
-        {\frac1K \sum_{j=1}^K e^{f(x_i, \theta_j | \xi)}}
+        U(\xi) = \frac1n \sum_{i=1}^n \log \frac{e^{f(x_i, \theta_i | \xi)}}
+        {\frac1{L + 1} \left[ e^{f(x_i, \theta_i | \xi)} +
+        \sum_{l=1}^L e^{f(x_i, \theta'_l | \xi)} \right]}
 
-    on each block of K simulations, :math:`\theta_i \sim p`, :math:`x_i \sim p(x |
-    \theta_i, \xi)`, with f the model's ``log_ratio``, or else its ``log_likelihood``.
-    It is a lower bound for any f, on simulations that f was not trained on, and does
-    not change where f is off by a function of x. It cannot exceed log K, near which
-    it does not rank. No further draws of the belief are needed.
-
-    The mean over a block is unchanged; as its simulations share each other's
-    parameters, a contribution includes what its own parameters do to the others,
-
-    .. math::
-        1 - \sum_{i=1}^K \frac{e^{f(x_i, \theta_j)}}{\sum_k e^{f(x_i, \theta_k)}}.
+    with :math:`\theta_i, \theta'_l \sim p`, :math:`x_i \sim p(x | \theta_i, \xi)`, and
+    f the model's ``log_ratio``, or else its ``log_likelihood``. It is a lower bound for
+    any f, on simulations that f was not trained on, and does not change where f is off
+    by a function of x. It cannot exceed log (L + 1), near which it does not rank.
 
     Args:
-        num_contrastive: L = K - 1, at most; blocks are as equal as they can be.
+        num_contrastive: Number of contrastive draws L.
 
     Raises:
         ValueError: If ``num_contrastive`` is below 1.
@@ -302,22 +264,11 @@ class InfoNCEGain(_Contrast):
         "InfoNCEGain is near its largest value, log K = {limit}, at {where}: it is too "
         "small there and does not rank; raise num_contrastive"
     )
+    own = 1
 
     def __init__(self, *, num_contrastive: int = 127) -> None:
-        self.num_contrastive = at_least(num_contrastive, 1, "num_contrastive", 100)
+        super().__init__(num_contrastive=num_contrastive)
 
-    def _limit(self, counted: Tensor) -> int:
-        # the smallest block limits; candidates may have lost rows to faults
-        return min(map(len, self._blocks(counted)), default=1)
-
-    def _compared(
-        self, counted: Tensor, simulations: CandidateSimulations, belief: Any
-    ) -> list[tuple[Tensor, Tensor]]:
-        theta = simulations.theta
-        return [(block, theta[block]) for block in self._blocks(counted)]
-
-    def _blocks(self, counted: Tensor) -> tuple[Tensor, ...]:
-        """Return the rows of each block, none larger than K."""
-        rows = torch.nonzero(counted)[:, 0]
-        num_blocks = -(-len(rows) // (self.num_contrastive + 1))
-        return rows.tensor_split(num_blocks) if num_blocks else ()
+    @override
+    def bound_on(self, model: Any) -> Bound:
+        return self.bound

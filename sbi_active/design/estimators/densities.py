@@ -7,7 +7,6 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from sklearn.discriminant_analysis import LinearDiscriminantAnalysis
 from torch import Tensor
 
 from sbi_active.arrays import Array
@@ -155,7 +154,11 @@ def class_members(
     ]
     if x.shape[1] == 0 or not bool(enough.all()):
         return members
-    reduce = _discriminating(x, label)
+    reduction = Reduction.fit(x, torch.nn.functional.one_hot(label).double())
+
+    def reduce(new: Tensor) -> Array:
+        return reduction(new).numpy()
+
     z = reduce(x)
     rows = [z[(label == k).numpy()] for k in range(num_classes)]
     scatter = np.stack([(r - r.mean(0)).T @ (r - r.mean(0)) for r in rows])
@@ -194,29 +197,6 @@ def _kernels(
     weights = np.append(np.full(n, (1 - tail) / n), tail)
     means = np.concatenate([knots, knots.mean(0)[None]])
     return StudentMixture(means, np.concatenate([factors, wide[None]]), weights, np.inf)
-
-
-def _discriminating(
-    x: Tensor, label: Tensor, num_spreads: int = 3
-) -> Callable[[Tensor], Array]:
-    """Return a map to few numbers: all that there are, or the classes' discriminants.
-
-    Beside these are some directions of equal means but other spreads. The covariance
-    within classes is shrunk as by Ledoit & Wolf, J. Multivariate Analysis 2004.
-    """
-    indicator = torch.nn.functional.one_hot(label).double()
-    first = Reduction.fit(x, indicator)
-    if x.shape[1] <= first.direction.shape[1]:
-        return lambda new: first(new).numpy()
-    z, num_classes = first.standard(x).numpy(), indicator.shape[1]
-    fit = LinearDiscriminantAnalysis(solver="eigen", shrinkage="auto")
-    white = fit.fit(z, label.numpy()).scalings_  # what whitens z within the classes
-    each = [(z @ white)[(label == k).numpy()] for k in range(num_classes)]
-    moments = np.stack([np.cov(own.T) for own in each])
-    other = ((moments - moments.mean(0)) ** 2).sum(0)
-    spreads = white @ np.linalg.eigh(other)[1][:, -num_spreads:]
-    direction = np.concatenate([white[:, : num_classes - 1], spreads], 1)
-    return lambda new: first.standard(new).numpy() @ direction
 
 
 #: Numbers of an outcome up to which each kernel has a covariance of its own.

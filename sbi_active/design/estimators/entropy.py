@@ -34,9 +34,9 @@ class EntropyGain(InformationGainEstimator):
     should be at most three.
 
     The second entropy is that of the declared noise at the noise-free outcome. Without
-    a declaration it is that of a Gaussian, its correlation common to all
-    parameters and the log of its variances quadratic in them, fitted to pairs of
-    outcomes at the same theta; :meth:`problems` tests normality.
+    a declaration it is that of a Gaussian of one covariance, fitted to pairs of
+    outcomes at the same theta; :meth:`problems` tests normality, which noise that
+    varies with theta fails as well.
 
     Where outcomes lack numbers,
 
@@ -163,43 +163,19 @@ def conditional_entropy(
 
 def standardized_pairs(
     simulations: CandidateSimulations, index: int, rows: Tensor
-) -> tuple[Tensor, Tensor]:
-    r"""Fit Gaussian noise to pairs of outcomes of one candidate, those of rows (n,).
+) -> tuple[Tensor, float]:
+    """Fit Gaussian noise of one covariance to pairs of one candidate, of rows (n,).
 
-    :math:`\log \sigma_c^2(\theta)` is quadratic where a regression of the log squares
-    on theta is significant (the variance of :math:`\log z^2` is :math:`\pi^2 / 2`),
-    else constant. Returns standardized differences of the
-    pairs, and the entropies at all parameters, shape (n,).
+    Returns standardized differences of the pairs, and the entropy of the noise.
     """
     assert simulations.replicate is not None
     difference = simulations.x[index, rows] - simulations.replicate[index, rows]
     difference = difference.flatten(1).double() / 2**0.5
-    n, d = difference.shape
-    theta = simulations.theta.double()
-    z = (theta - theta[rows].mean(0)) / theta[rows].std(0).clamp_min(1e-30)
-    everywhere = torch.cat([torch.ones(len(z), 1).double(), z, z**2], 1)
-    features = everywhere[rows]
     scale = difference.square().mean(0).clamp_min(1e-60).sqrt()
-    log_square = (difference / scale).square().clamp_min(1e-12).log()
-    log_square = log_square - log_square.mean(0)
-    half = torch.zeros(len(theta), d, dtype=torch.float64)
-    freedom = features.shape[1] - 1
-    if n > 5 * freedom:
-        slope = torch.linalg.lstsq(features, log_square).solution
-        chi_square = (features @ slope).square().sum(0) / (math.pi**2 / 2)
-        limit = freedom + 5 * math.sqrt(2 * freedom)  # homogeneous unless it is clear
-        half = 0.5 * torch.where(chi_square > limit, everywhere @ slope, 0.0)
-    standardized = difference / half[rows].exp()
-    scale = standardized.square().mean(0).clamp_min(1e-60).sqrt()
-    standardized = standardized / scale
-    correlation = standardized.T @ standardized / n
-    log_det = torch.linalg.slogdet(correlation).logabsdet
-    entropy = (
-        0.5 * d * (math.log(2 * math.pi) + 1)
-        + (half + scale.log()).sum(1)
-        + 0.5 * log_det
-    )
-    return standardized, entropy
+    standardized = difference / scale
+    correlation = standardized.T @ standardized / len(standardized)
+    log_det = float(torch.linalg.slogdet(correlation).logabsdet + 2 * scale.log().sum())
+    return standardized, 0.5 * (len(scale) * (math.log(2 * math.pi) + 1) + log_det)
 
 
 def with_control(gain: Tensor, excess: Tensor) -> Tensor:

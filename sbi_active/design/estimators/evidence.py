@@ -22,6 +22,9 @@ class Evidence:
     Attributes:
         emulator: Emulator of the noise-free outcomes.
         columns: Columns of the candidate in it.
+        missed: Whether the emulator misses an outcome that it was not fitted to by more
+            than the noise, shape (n,). Outcomes near such a simulation are taken to be
+            linear from its own, by the emulator's slope.
         mean: Noise-free outcomes of the simulations.
         scale: Scale of the noise of each number.
         share: Share of each simulation's outcomes that are complete, shape (n,).
@@ -36,10 +39,12 @@ class Evidence:
         defense: Period of the local draws that are close to theta_i itself, lest all
             others miss.
         closer: Width of these, in those of the proposals.
+        rare: Relative variance of an evidence that rests on a draw or two.
     """
 
     emulator: MeanEmulator
     columns: slice
+    missed: Tensor
     mean: Tensor
     scale: Tensor
     share: Tensor
@@ -53,21 +58,30 @@ class Evidence:
     enough: int = 50
     defense: int = 4
     closer: float = 0.2
+    rare: float = 0.5
 
     @property
     def knots(self) -> Tensor:
         """Coordinates of the simulations, shape (n, d)."""
         return self.emulator.knots
 
-    def __call__(self, x: Tensor, slope: Tensor, rows: Tensor) -> tuple[Tensor, Tensor]:
-        """Return log evidences without Jensen's bias, and what they rest on.
+    def __call__(
+        self, x: Tensor, slope: Tensor, rows: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        r"""Return log evidences without Jensen's bias, and what they rest on.
 
-        That is the share of each simulation in them, summed over the outcomes, shape
-        (n,); local draws have the rest.
+        That is the share of each simulation in them, summed over the outcomes, and the
+        share of local draws in each, all of shape (n,). Where a draw or two are all
+        that there is, as where a bound of the belief is near, the evidence is at least
+        that of the linear model in an orthant at :math:`\theta_i`:
+
+        .. math::
+            p(x_i) \ge p(x_i | \theta_i)\, b(\theta_i)\, (\pi / 2)^{d / 2}
+            \left| J^\top J + \Sigma^{-1} \right|^{-1/2} .
         """
         m, num_local = int(self.counted.sum()) - 1, self.num_local
         parts = []
-        influence = torch.zeros(len(self.knots), dtype=torch.float64)
+        influence, local = torch.zeros(2, len(self.knots), dtype=torch.float64)
         with forked_generators(0):  # the same base draws for all candidates
             for some in rows.split(256):
                 shared = self._shared(x, some)
@@ -76,12 +90,17 @@ class Evidence:
                 poor = torch.nonzero(~(variance + 1 / m <= 1 / self.enough))[:, 0]
                 if len(poor):
                     i = some[poor]
-                    terms = self._with_local(x[i], slope[i], i, shared[poor])
-                    log_p[poor], variance[poor] = _log_mean(terms, m, m + num_local)
-                    weight[poor] = terms.softmax(1)[:, :-num_local]
+                    terms, least = self._with_local(x[i], slope[i], i, shared[poor])
+                    log_q, spread = _log_mean(terms, m, m + num_local)
+                    own = terms.softmax(1).nan_to_num()
+                    weight[poor] = own[:, :-num_local]
+                    few = ~(spread <= self.rare) & ~(log_q >= least)
+                    log_p[poor] = torch.where(few, least, log_q)
+                    variance[poor] = torch.where(few, 0.0, spread)
+                    local[i] = torch.where(few, 1.0, own[:, -num_local:].sum(1))
                 parts.append(log_p + 0.5 * variance)
                 influence += self.share[some] @ weight.nan_to_num()
-        return torch.cat(parts), influence
+        return torch.cat(parts), influence, local
 
     def _shared(self, x: Tensor, rows: Tensor) -> Tensor:
         """Log density p(x_i | theta_j), -inf for j = i, shape (rows, n)."""
@@ -94,9 +113,13 @@ class Evidence:
 
     def _with_local(
         self, x: Tensor, slope: Tensor, i: Tensor, shared: Tensor
-    ) -> Tensor:
-        """Log terms of the sum of simulations and local draws, shape (i, n + l)."""
-        location, factor = self._linearized(x, slope, i)
+    ) -> tuple[Tensor, Tensor]:
+        """Log terms of the sum of simulations and local draws, shape (i, n + l).
+
+        Beside them is the least that the evidences may be, shape (i,).
+        """
+        location, precision = self._linearized(x, slope, i)
+        factor = self.wider * torch.linalg.cholesky(torch.linalg.inv(precision))
         (n, d), num_local = location.shape, self.num_local
         ratio = math.log(num_local / (len(self.knots) - 1))
         step = _student((n, num_local, d), self.degrees) @ factor.mT
@@ -106,7 +129,7 @@ class Evidence:
         flat = z.flatten(0, 1)
         log_b = log_belief(self.belief, self.emulator, flat).reshape(n, num_local)
         inside = torch.nonzero(log_b.flatten().isfinite())[:, 0]
-        mean = self.emulator(flat[inside], self.columns) * self.scale
+        mean = self._outcomes(z, slope, i).flatten(0, 1)[inside] * self.scale
         outcome = x.repeat_interleave(num_local, 0)[inside]
         local = torch.full((n * num_local,), -torch.inf).double()
         local[inside] = self.noise.log_prob(outcome, mean.reshape(outcome.shape))
@@ -117,7 +140,16 @@ class Evidence:
         )
         log_t = self._log_proposal(self.knots, location, i, factor)
         shared = shared - torch.nn.functional.softplus(ratio + log_t - self.log_belief)
-        return torch.cat([shared, local], 1)
+        least = self.noise.log_prob(x, self.mean[i]) + self.log_belief[i]
+        least += 0.5 * (d * math.log(math.pi / 2) - torch.logdet(precision))
+        return torch.cat([shared, local], 1), least
+
+    def _outcomes(self, z: Tensor, slope: Tensor, i: Tensor) -> Tensor:
+        """Noise-free outcomes at z (i, k, d) around simulations i, (i, k, q)."""
+        found = self.emulator(z.flatten(0, 1), self.columns).unflatten(0, z.shape[:2])
+        own = (self.mean[i].flatten(1) / self.scale)[:, None]
+        straight = own + (z - self.knots[i][:, None]) @ slope.mT
+        return torch.where(self.missed[i][:, None, None], straight, found)
 
     def _log_complete(self, z: Tensor) -> Tensor:
         """Log probability of a complete outcome, that of the nearest simulation."""
@@ -140,31 +172,35 @@ class Evidence:
         )
 
     def _linearized(self, x: Tensor, slope: Tensor, i: Tensor) -> tuple[Tensor, Tensor]:
-        """Location and lower factor of the posterior given x, one step from theta_i.
+        """Location and precision of the posterior given x, one step from theta_i.
 
         The belief enters as the Gaussian of its draws' moments. A step is kept where
         it does not raise the misfit.
         """
-        z, d = self.knots[i], self.knots.shape[1]
-        center = self.knots.mean(0)
-        spread = torch.cov(self.knots.T).reshape(d, d) + 1e-9 * torch.eye(d)
-        prior = torch.linalg.inv(spread)
+        z, center = self.knots[i], self.knots.mean(0)
+        prior = precision_of(self.knots)
 
-        def misfit(z: Tensor, residual: Tensor) -> Tensor:
-            offset = z - center
-            return residual.square().sum(1) + (offset @ prior * offset).sum(1)
+        def misfit(z: Tensor, outcome: Tensor) -> Tensor:
+            residual = x.flatten(1) / self.scale - outcome
+            return residual.square().sum(1) + ((z - center) @ prior * (z - center)).sum(
+                1
+            )
 
-        residual = (x - self.mean[i]).flatten(1) / self.scale
+        own = self.mean[i].flatten(1) / self.scale
+        residual = x.flatten(1) / self.scale - own
         precision = slope.mT @ slope + prior
         gradient = (slope.mT @ residual[..., None])[..., 0] - (z - center) @ prior
         moved = z + torch.linalg.solve(precision, gradient[..., None])[..., 0]
-        after = x.flatten(1) / self.scale - self.emulator(moved, self.columns)
-        better = misfit(moved, after) < misfit(z, residual)
-        location = torch.where(better[:, None], moved, z)
-        covariance = torch.linalg.inv(precision)
-        return location, self.wider * torch.linalg.cholesky(
-            0.5 * (covariance + covariance.mT)
-        )
+        after = self._outcomes(moved[:, None], slope, i)[:, 0]
+        better = misfit(moved, after) < misfit(z, own)
+        return torch.where(better[:, None], moved, z), precision
+
+
+def precision_of(theta: Tensor) -> Tensor:
+    """Return the inverse covariance of parameters (n, d) of about unit size, (d, d)."""
+    d = theta.shape[1]
+    spread = torch.cov(theta.T).reshape(d, d) + 1e-9 * torch.eye(d)
+    return torch.linalg.inv(spread)
 
 
 def _pairwise(noise: NoiseModel, x: Tensor, mean: Tensor) -> Tensor:

@@ -2,7 +2,7 @@ r"""Information gain of outcomes of many numbers, as if linear in the parameters
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any
 
 import torch
@@ -12,7 +12,6 @@ from typing_extensions import override
 from sbi_active.design.estimators.base import (
     CandidateSimulations,
     InformationGainEstimator,
-    numbers_of,
 )
 
 NUM_GROUPS = 24  # of simulations, each left out in turn
@@ -45,13 +44,10 @@ class LinearGain(InformationGainEstimator):
     of it, counts as no information.
 
     Args:
-        index: Places of the parameters S, or a function of parameters (n, d) whose
-            numbers (n, k) stand for them; None are all.
+        target: Function of parameters (n, d) that gives theta_S or numbers that stand
+            for it, (n, k); None are all.
         max_bent: Deviations of the noise that outcomes may be off a plane without a
             word.
-
-    Raises:
-        ValueError: If no parameter or one twice is named.
 
     References:
         Chaloner & Verdinelli, Statistical Science 10 (1995), 273-304 (Bayesian D-
@@ -77,11 +73,11 @@ class LinearGain(InformationGainEstimator):
 
     def __init__(
         self,
-        index: Sequence[int] | Callable[[Tensor], Tensor] | None = None,
+        target: Callable[[Tensor], Tensor] | None = None,
         *,
         max_bent: float = 1.0,
     ) -> None:
-        self.target = None if index is None else numbers_of(index)
+        self.target = target or (lambda theta: theta)
         self.max_bent = max_bent
 
     def suits(self, simulations: CandidateSimulations, num_rows: int) -> bool:
@@ -120,8 +116,7 @@ class LinearGain(InformationGainEstimator):
                 "expected declared noise for LinearGain; got replicates; build "
                 "SimulatorModel(fn, noise=...) around a noise-free fn"
             )
-        theta = simulations.theta
-        theta = (theta if self.target is None else self.target(theta)).double()
+        theta = self.target(simulations.theta).double()
         gain = torch.full(mean.shape[:2], torch.nan, dtype=torch.float64)
         for a, row in enumerate(mean):
             y = noise.whiten(row).flatten(1)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -17,7 +17,6 @@ from sbi_active.design.estimators.base import (
     Bound,
     CandidateSimulations,
     InformationGainEstimator,
-    numbers_of,
 )
 from sbi_active.design.estimators.densities import (
     Reduction,
@@ -53,7 +52,6 @@ class PosteriorGain(InformationGainEstimator):
     """
 
     bound: Bound = "lower"
-    rowwise = True
     batch_size: int = 50_000  # rows in one pass of the network
 
     def _contributions(
@@ -93,14 +91,11 @@ class ParameterGain(InformationGainEstimator):
     numbers of x are present.
 
     Args:
-        index: Places of the parameters S, or a function of parameters (n, d) whose
-            numbers (n, k) stand for them.
+        target: Function of parameters (n, d) that gives theta_S or numbers that stand
+            for it, (n, k); None are all.
         num_marginal: Number of draws of the belief for the marginal of the target; of a
             tenth its entropy has an error of .03 nat, common to all candidates.
         few: Outcomes of one pattern whose numbers are not used.
-
-    Raises:
-        ValueError: If no parameter or one twice is named.
 
     References:
         Barber & Agakov, NeurIPS 2003; Foster et al., NeurIPS 2019 (variational bounds
@@ -112,12 +107,12 @@ class ParameterGain(InformationGainEstimator):
 
     def __init__(
         self,
-        index: Sequence[int] | Callable[[Tensor], Tensor],
+        target: Callable[[Tensor], Tensor] | None = None,
         *,
         num_marginal: int = 20_000,
         few: int = 24,
     ) -> None:
-        self.target = numbers_of(index)
+        self.target = target or (lambda theta: theta)
         self.num_marginal, self.few = num_marginal, few
         self._marginal: tuple[Distribution, QuantileTransformer, float] | None = None
 

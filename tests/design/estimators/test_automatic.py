@@ -46,11 +46,11 @@ def unusable(actions=NEAR, n=512):
     ],
 )
 def test_what_the_model_can_say_is_used_where_the_noise_cannot(model, estimator):
-    chosen, notes = choose_estimator(model, unusable())
+    chosen, notes = choose_estimator(model, unusable(), PRIOR)
     assert "noise is not Gaussian" in notes[0]
     if model is None:
         assert notes[-1] == "used all the same: there is no model"
-        estimator = type(choose_estimator(None, rows(pairs=True))[0])
+        estimator = type(choose_estimator(None, rows(pairs=True), PRIOR)[0])
     assert type(chosen) is estimator
 
 
@@ -68,12 +68,12 @@ def test_many_parameters_that_outcomes_are_linear_in_have_the_linear_estimate(
     given = CandidateSimulations(
         theta.float(), torch.zeros(1, 1), x, mean, GaussianNoise(1.0)
     )
-    chosen, _ = choose_estimator(ExactLikelihood(), given)
+    chosen, _ = choose_estimator(ExactLikelihood(), given, None)
     assert (type(chosen) is LinearGain) == linear
 
 
 def test_a_ratio_beyond_the_reach_of_info_nce_is_averaged():
-    chosen, notes = choose_estimator(ExactRatio(), unusable(FAR))
+    chosen, notes = choose_estimator(ExactRatio(), unusable(FAR), PRIOR)
     assert type(chosen) is RatioGain
     assert "not used: InfoNCEGain is near its largest value, log K = 4.9" in notes[-1]
     assert "at 1 of 2 actions" in notes[-1]

@@ -75,3 +75,15 @@ def test_noise_that_is_not_gaussian_is_noticed():
     assert EntropyGain().problems(declared()) == []
     (problem,) = EntropyGain().problems(replicated(noise=two_sided))
     assert problem.startswith("noise is not Gaussian")
+
+
+def test_noise_that_varies_with_the_parameters_is_noticed():
+    torch.manual_seed(0)
+    theta = PRIOR.sample((1_000,))
+    x, again = (
+        ACTIONS[:, None] * theta + torch.exp(0.3 * theta) * torch.randn(4, 1_000, 2)
+        for _ in "ab"
+    )
+    rows = CandidateSimulations(theta, ACTIONS, x, replicate=again)
+    (problem,) = EntropyGain().problems(rows)
+    assert problem.startswith("noise is not Gaussian")

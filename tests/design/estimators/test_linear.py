@@ -87,7 +87,9 @@ def test_what_is_bent_counts_as_noise():
 
 def test_of_some_parameters_it_is_exact_with_the_others_as_nuisances():
     """I(theta_S; x) = (log |S| - log |S after|) / 2 by the covariances of theta_S."""
-    gain = LinearGain([0, 2])(None, linear_case(GaussianNoise(0.1)), BELIEF)
+    gain = LinearGain(lambda t: t[:, [0, 2]])(
+        None, linear_case(GaussianNoise(0.1)), BELIEF
+    )
     prior = BELIEF.covariance_matrix.double()
     for k, a in enumerate((0.5, 3.0)):
         j = jacobian(a)

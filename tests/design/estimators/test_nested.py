@@ -3,14 +3,17 @@
 Tolerances are four standard errors and a stated bound of the bias.
 """
 
+import math
+
 import torch
 from sbi.utils import BoxUniform
 
 from sbi_active.design import EntropyGain, NestedGain
-from sbi_active.design.estimators.automatic import choose_estimator
 from sbi_active.design.estimators.base import CandidateSimulations
 from sbi_active.design.estimators.emulator import MeanEmulator, declare
-from sbi_active.simulation import GaussianNoise
+from sbi_active.design.sampler import CandidateSampler
+from sbi_active.simulation import GaussianNoise, SimulatorModel
+from sbi_active.simulation.workers.settings import IN_PROCESS
 from sbi_active.tasks.oscillator import model
 from sbi_active.tasks.oscillator.reference import OscillatorReference
 from tests.design.estimators.test_entropy import ACTIONS, declared
@@ -51,7 +54,8 @@ def test_six_numbers_that_four_parameters_make():
     """Gains of .3 to 7.6 nats; the emulator bends where the sensor saturates."""
     index = torch.tensor([6, 16, 23, 33])
     rows, prior = oscillator(400, index)
-    assert NestedGain().problems(rows) == NestedGain().doubts(rows) == []
+    assert NestedGain().problems(rows) == []
+    assert not NestedGain().needs_slopes(rows)
     gain, error = estimate(rows, prior)
     exact, exact_error = OscillatorReference([], []).expected_information_gain(
         model.ACTIONS[index], num_outer=200, num_inner=50_000
@@ -64,20 +68,28 @@ def test_six_numbers_that_four_parameters_make():
     assert (coarse - exact).abs().max() > 1.0
 
 
-def test_outcomes_that_the_emulator_misses_at_one_action_are_noticed():
-    """Smooth at one action and rough at another: half of the numbers pass the check."""
-    torch.manual_seed(0)
-    theta = PRIOR.sample((200,))
-    rough = torch.cat([theta, theta, theta, 10 * torch.sin(50 * theta)], 1)
-    mean = torch.stack([theta.repeat(1, 4), rough])
-    noise = GaussianNoise(0.1)
-    rows = CandidateSimulations(
-        theta, torch.zeros(2, 1), noise.sample(mean), mean=mean, noise=noise
+def test_where_the_emulator_misses_slopes_of_the_simulator_count():
+    """A rough shear keeps volumes: 11.6 nats; without slopes they were thousands."""
+    sd, action = 0.003, torch.zeros(1, 1)
+
+    def shear(theta, action):
+        rough = 3 * torch.sin(20 * theta[:, :1])
+        return torch.cat([theta[:, :1], theta[:, 1:] + rough], 1)
+
+    model = SimulatorModel(shear, noise=GaussianNoise(sd))
+    sampler = CandidateSampler(
+        *(model, PRIOR, action, 0, IN_PROCESS, torch.empty(0, 1), 200, True)
     )
-    assert NestedGain().problems(rows) == []
-    (doubt,) = NestedGain().doubts(rows)
-    assert "misses 9" in doubt or "misses 100%" in doubt
-    assert choose_estimator(None, rows)[1] == [doubt]
+    rows = sampler.draw(300, action)
+    assert NestedGain().needs_slopes(rows)
+    sloped = sampler.add_slopes(rows)
+    assert sampler.num_drawn == 300 + 2 * 64
+    gain, error = estimate(sloped)
+    exact = -2 * math.log(sd)
+    assert abs(float(gain) - exact) < 3 * float(error) + BIAS
+    assert float(error) < 0.3
+    assert abs(float(estimate(rows)[0]) - exact) > 3 * float(error)  # negative control
+    assert "slopes of the simulator" in NestedGain().remarks(sloped)[-1]
 
 
 def test_noise_that_is_not_declared_is_learned():
