@@ -34,14 +34,4 @@ __all__ = [
     "Search",
 ]
 
-__getattr__ = former_names(
-    __name__,
-    {
-        "CandidateSimulations": (
-            "sbi_active.design.estimators.base:CandidateSimulations"
-        ),
-        "Evaluations": "sbi_active.design.search:Evaluations",
-        "InfoNCEGain": "sbi_active.design.estimators.contrast:InfoNCEGain",
-        "Objective": "sbi_active.design.search:Objective",
-    },
-)
+__getattr__ = former_names(__name__)

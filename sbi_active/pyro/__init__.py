@@ -18,11 +18,4 @@ __all__ = [
     "from_pyro",
 ]
 
-__getattr__ = former_names(
-    __name__,
-    {
-        "Denoised": "sbi_active.pyro.denoising:Denoised",
-        "PyroProblem": "sbi_active.pyro.models:PyroProblem",
-        "denoise": "sbi_active.pyro.denoising:denoise",
-    },
-)
+__getattr__ = former_names(__name__)
