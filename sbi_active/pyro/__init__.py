@@ -1,7 +1,8 @@
 """Pyro: robust updates by error models, and Pyro models as simulators.
 
-This package contains the error model between a simulator and a measurement, the trainer that averages over denoised outcomes, and the reader of a Pyro model. It
-needs the extra ``pyro``. Effects that a simulator lacks are in ``criticism``.
+This package contains the error model between a simulator and a measurement, the trainer
+that averages over denoised outcomes, and the reader of a Pyro model. It needs the extra
+``pyro``. Effects that a simulator lacks are in ``criticism``.
 """
 
 from sbi_active.pyro.denoising import SpikeAndSlab

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import functools
 import inspect
 import warnings
 from abc import abstractmethod
 from collections.abc import Callable, Mapping
 from contextlib import nullcontext
-from typing import Any, ClassVar, TypeVar
+from typing import Any, ClassVar
 
 import cloudpickle
 import torch
@@ -26,26 +27,25 @@ from typing_extensions import Self
 from sbi_active.expected import require
 from sbi_active.inference.networks.mixture_density import MixtureDensity, train_network
 from sbi_active.inference.rounds.condition import pack
-from sbi_active.inference.rounds.rows import check_proposal
+from sbi_active.inference.rounds.rows import check_proposal, require_whole
 from sbi_active.inference.sampling.adam import Adam
 from sbi_active.inference.trainers.base import ActiveInference
 from sbi_active.simulation.outcomes import Simulations
 from sbi_active.threads import single_thread
 
-Ours = TypeVar("Ours", bound=Callable[..., Any])
 
+def _extended(ours: Callable[..., Any], theirs: Callable[..., Any]) -> Any:
+    """Return a method with the signature of sbi's, and keywords of its own after it."""
 
-def extends(theirs: Callable[..., Any]) -> Callable[[Ours], Ours]:
-    """Give a method the signature of sbi's, with keywords of its own after that."""
+    @functools.wraps(ours)
+    def call(*args: Any, **kwargs: Any) -> Any:
+        return ours(*args, **kwargs)
 
-    def decorate(ours: Ours) -> Ours:
-        further = inspect.signature(ours).parameters.values()
-        own = [p for p in further if p.kind is inspect.Parameter.KEYWORD_ONLY]
-        known = inspect.signature(theirs).parameters.values()
-        ours.__signature__ = inspect.Signature([*known, *own])  # pyright: ignore
-        return ours
-
-    return decorate
+    further = inspect.signature(ours).parameters.values()
+    own = [p for p in further if p.kind is inspect.Parameter.KEYWORD_ONLY]
+    known = inspect.signature(theirs).parameters.values()
+    call.__signature__ = inspect.Signature([*known, *own])  # pyright: ignore
+    return call
 
 
 def given_arguments(
@@ -99,6 +99,8 @@ class ActionRounds(ActiveInference):
     _settings: ClassVar[type] = MixtureDensity
     #: sbi's name of the estimator.
     _sbi_name: ClassVar[str] = "density_estimator"
+    #: Whether outcomes may be measured in part.
+    _takes_partial: ClassVar[bool] = False
 
     # Attributes of sbi's trainers.
     _device: str
@@ -107,6 +109,16 @@ class ActionRounds(ActiveInference):
     _action_estimator: Any
     train_indices: Tensor
     val_indices: Tensor
+
+    def __init_subclass__(cls, **kwargs: Any) -> None:
+        """Give public methods the signatures of the trainer of sbi's beside this."""
+        super().__init_subclass__(**kwargs)
+        theirs: Any = cls.__bases__[-1]
+        if not issubclass(theirs, ActiveInference):
+            for name in ("__init__", "append_simulations", "train"):
+                made = _extended(getattr(cls, name), getattr(theirs, name))
+                setattr(cls, name, made)
+
     _theta_roundwise: list[Tensor]
     _x_roundwise: list[Tensor]
     _prior_masks: list[Tensor]
@@ -312,23 +324,53 @@ class ActionRounds(ActiveInference):
         )
         return False
 
-    def _append_round(
+    def append_simulations(
         self,
-        theta: Tensor,
-        x: Tensor,
-        action: Tensor,
-        belief: Distribution | None,
-        exclude_invalid_x: bool | None,
-        data_device: str | None,
-        proposal: Any = None,
+        *args: Any,
+        action: Tensor | None = None,
+        belief: Distribution | None = None,
+        **kwargs: Any,
     ) -> Self:
-        check_proposal(proposal, self.belief if belief is None else belief)
-        if exclude_invalid_x is None:
-            exclude_invalid_x = not self._has_settings
+        r"""Store simulations for training, with the arguments of sbi's own method.
+
+        Without ``action`` it is sbi's method. With it, the rows belong to the round of
+        ``belief``; the same belief appended again continues that round.
+
+        Args:
+            args: Parameters theta, shape (n, theta_dim), drawn from the belief;
+                outcomes x, shape (n, *x_shape), NaN where there was no measurement; and
+                what else sbi's method takes. With actions, a ``proposal`` is the belief
+                itself or sbi's ``RestrictedPrior`` of it. ``exclude_invalid_x`` says
+                whether to drop rows with NaN: by default they are kept for this
+                library's networks, as information, and dropped for sbi's, which cannot
+                take them, with a warning. Information gain is biased towards actions
+                that fail where they are dropped, since what failures tell about theta
+                is lost and what is left is all success.
+            action: Actions, shape (n, action_dim), or (action_dim,) for all rows.
+            belief: The distribution of theta in this round; None is the current one.
+            kwargs: The same by name.
+
+        Returns:
+            The trainer, so that calls chain.
+
+        Raises:
+            ValueError: If rounds with and without action mix, shapes do not fit, theta
+                leaves the prior's support, or no row is valid; if a likelihood or ratio
+                would be learned of outcomes that are observed in part.
+        """
+        given = given_arguments(self._sbi.append_simulations, args, kwargs)
+        if not self._is_round(action, belief):
+            return self._sbi.append_simulations(**given)
+        assert action is not None
+        check_proposal(given.get("proposal"), self.belief if belief is None else belief)
+        exclude_invalid_x = given.get("exclude_invalid_x", not self._has_settings)
+        theta, x = given["theta"], given["x"]
+        if not (exclude_invalid_x or self._takes_partial):
+            require_whole(x)
+        device = given.get("data_device", self._device)
         own = theta, x, action, belief
         rows, is_new = self._new_rows(*own, exclude_invalid=exclude_invalid_x)
         current = max(self._data_round_index, default=-1)
-        device = self._device if data_device is None else data_device
         if is_new:
             current += 1
             # Nothing is trained on earlier rounds, which may be gigabytes.
@@ -340,6 +382,7 @@ class ActionRounds(ActiveInference):
             outcomes = torch.cat([seen, outcomes])
         self._trained_round = None
         self._theta_roundwise, self._x_roundwise = [parameters], [outcomes]
+        self._proposal_roundwise = [None]  # which sbi's posterior estimators have
         self._prior_masks = [mask_sims_from_prior(current, len(parameters))]
         self._data_round_index = [current]
         return self

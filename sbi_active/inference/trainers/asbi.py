@@ -14,7 +14,6 @@ from sbi.inference.trainers.npe.npe_base import PosteriorEstimatorTrainer
 from sbi.neural_nets.estimators.base import ConditionalDensityEstimator
 from torch import Tensor
 from torch.distributions import Distribution
-from typing_extensions import Self
 
 from sbi_active.expected import require
 from sbi_active.inference.beliefs.belief import Belief, ChainedBelief, UnchangedBelief
@@ -24,7 +23,7 @@ from sbi_active.inference.models.posterior import ActionPosterior
 from sbi_active.inference.networks.mixture_network import MixtureDensityNetwork
 from sbi_active.inference.rounds.condition import pack
 from sbi_active.inference.rounds.rows import Observation
-from sbi_active.inference.trainers.action_rounds import ActionRounds, extends
+from sbi_active.inference.trainers.action_rounds import ActionRounds
 from sbi_active.inference.trainers.base import is_finite_somewhere
 from sbi_active.messages import warn
 from sbi_active.seeding import kept_generators
@@ -44,6 +43,10 @@ class ASBI(ActionRounds, NPE_C):
 
     ``build_posterior`` then gives an :class:`.ActionPosterior`, whose prior is the
     belief of the round unless another is passed.
+
+    ``train`` then refuses ``num_atoms``, ``discard_prior_samples`` and
+    ``use_combined_loss``, which have no meaning in such a round, and
+    ``calibration_kernel`` for :class:`MixtureDensity`.
 
     ``update`` without a simulator is Step 3 of the paper, the network's value at the
     trial: :math:`b(\theta) = q(\theta | x_o, \xi^*)` within the prior's support, a
@@ -85,68 +88,7 @@ class ASBI(ActionRounds, NPE_C):
         torch.Size([3, 1])
     """
 
-    @extends(NPE_C.__init__)
-    def __init__(self, *args: Any, **kwargs: Any) -> None:
-        super().__init__(*args, **kwargs)
-
-    def append_simulations(
-        self,
-        theta: Tensor,
-        x: Tensor,
-        proposal: Any = None,
-        exclude_invalid_x: bool | None = None,
-        data_device: str | None = None,
-        *,
-        action: Tensor | None = None,
-        belief: Distribution | None = None,
-    ) -> Self:
-        r"""Store simulations for training.
-
-        Without ``action`` this is sbi's method. With it, the rows belong to the round
-        of ``belief``; the same belief appended again continues that round.
-
-        Args:
-            theta: Parameters, shape (n, theta_dim), drawn from the belief.
-            x: Outcomes, shape (n, *x_shape); NaN where there was no measurement.
-            proposal: Proposal, without actions as in sbi. With them, None, the belief
-                itself or sbi's ``RestrictedPrior`` of it.
-            exclude_invalid_x: Whether to drop rows with NaN. With actions, None keeps
-                them with NaN as information for :class:`MixtureDensity`, and drops them
-                for sbi's networks, which cannot take them, with a warning. True drops
-                them: information gain is then biased towards actions that fail, since
-                what failures tell about theta is lost and what is left is all success.
-            data_device: Device that keeps the rows.
-            action: Actions, shape (n, action_dim), or (action_dim,) for all rows.
-            belief: The distribution of theta in this round; None is the current one.
-
-        Returns:
-            The trainer, so that calls chain.
-
-        Raises:
-            ValueError: If rounds with and without action mix, shapes do not fit, theta
-                leaves the prior's support, or no row is valid.
-        """
-        if not self._is_round(action, belief):
-            return super().append_simulations(
-                theta, x, proposal, exclude_invalid_x, data_device
-            )
-        assert action is not None
-        self._append_round(
-            theta, x, action, belief, exclude_invalid_x, data_device, proposal
-        )
-        self._proposal_roundwise.append(None)
-        return self
-
-    @extends(NPE_C.train)
-    def train(self, *args: Any, **kwargs: Any) -> Any:
-        """Train the density estimator, see :meth:`.ActionRounds.train`.
-
-        Raises:
-            ValueError: If with actions ``num_atoms``, ``discard_prior_samples`` or
-                ``use_combined_loss`` are given, which have no meaning there, or
-                ``calibration_kernel`` for :class:`MixtureDensity`.
-        """
-        return super().train(*args, **kwargs)
+    _takes_partial = True
 
     def _train_round(self, **arguments: Any) -> ConditionalDensityEstimator:
         others = ["calibration_kernel"] if self._has_settings else []

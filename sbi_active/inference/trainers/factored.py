@@ -31,7 +31,7 @@ from sbi_active.inference.networks.likelihood_network import LikelihoodNetwork
 from sbi_active.inference.networks.ratio_network import RatioClassifier, RatioNetwork
 from sbi_active.inference.rounds.rows import Observation, require_whole
 from sbi_active.inference.sampling.coordinates import PriorCoordinates
-from sbi_active.inference.trainers.action_rounds import ActionRounds, extends
+from sbi_active.inference.trainers.action_rounds import ActionRounds
 from sbi_active.inference.trainers.base import is_finite_somewhere
 from sbi_active.inference.trainers.seqbed import SeqBED_LFIRE
 from sbi_active.messages import ChangedWarning, warn
@@ -71,64 +71,14 @@ class ProductRounds(ActionRounds):
 
     _factor: ClassVar[type[ActionFactor]]
 
-    def __init__(self, *args: Any, posterior: str, **kwargs: Any) -> None:
+    def __init__(
+        self, *args: Any, posterior: str = "importance", **kwargs: Any
+    ) -> None:
         known = ", ".join(map(repr, SAMPLERS))
         advice = f"posterior among {known}", repr(posterior), "choose one of these"
         require(posterior in SAMPLERS, *advice)
         super().__init__(*args, **kwargs)
         self._sampler = posterior
-
-    def append_simulations(
-        self,
-        theta: Tensor,
-        x: Tensor,
-        exclude_invalid_x: bool | None = None,
-        from_round: int = 0,
-        algorithm: str | None = None,
-        data_device: str | None = None,
-        *,
-        action: Tensor | None = None,
-        belief: Distribution | None = None,
-    ) -> Self:
-        """Store simulations for training.
-
-        Without ``action`` this is sbi's method. With it, the rows belong to the round
-        of ``belief``; the same belief appended again continues that round.
-
-        Args:
-            theta: Parameters, shape (n, theta_dim), drawn from the belief.
-            x: Outcomes, shape (n, *x_shape); NaN throughout a row where there was no
-                measurement.
-            exclude_invalid_x: Whether to drop rows without a measurement. With actions,
-                None keeps them for this library's networks, which learn their
-                probability, and drops them for sbi's, with a warning.
-            from_round: Round number, as in sbi; without meaning where there are
-                actions.
-            algorithm: Algorithm name, as in sbi; None is sbi's.
-            data_device: Device that keeps the rows.
-            action: Actions, shape (n, action_dim), or (action_dim,) for all rows.
-            belief: The distribution of theta in this round; None is the current one.
-
-        Raises:
-            ValueError: If rounds with and without action mix, shapes do not fit, theta
-                leaves the prior's support, or an outcome is observed in part.
-        """
-        if not self._is_round(action, belief):
-            named = {} if algorithm is None else {"algorithm": algorithm}
-            return self._sbi.append_simulations(
-                theta,
-                x,
-                exclude_invalid_x=bool(exclude_invalid_x),
-                from_round=from_round,
-                data_device=data_device,
-                **named,
-            )
-        assert action is not None
-        if self._has_settings and not exclude_invalid_x:
-            require_whole(x)
-        return self._append_round(
-            theta, x, action, belief, exclude_invalid_x, data_device
-        )
 
     def _model(self, estimator: Any, *arguments: Any) -> ActionFactor:
         assert self._outcome_shape is not None
@@ -243,19 +193,8 @@ class ALHI(ProductRounds, NLE_A):
 
     _factor = ActionLikelihood
 
-    @extends(NLE_A.__init__)
-    def __init__(
-        self, *args: Any, posterior: str = "importance", **kwargs: Any
-    ) -> None:
-        super().__init__(*args, posterior=posterior, **kwargs)
-
     def _stored(self, rows: Simulations) -> tuple[Tensor, Tensor]:
         return torch.cat([rows.theta, rows.action], 1), rows.x.flatten(1).clone()
-
-    @extends(NLE_A.train)
-    def train(self, *args: Any, **kwargs: Any) -> Any:
-        """Train the density estimator, see :meth:`.ActionRounds.train`."""
-        return super().train(*args, **kwargs)
 
     def _network(self, theta: Tensor, x: Tensor) -> LikelihoodNetwork:
         assert self._action_dim is not None
@@ -318,12 +257,6 @@ class SeqBED(ProductRounds, NRE_C):
     _is_default: bool
     _get_losses: Callable[..., Tensor]
 
-    @extends(NRE_C.__init__)
-    def __init__(
-        self, *args: Any, posterior: str = "importance", **kwargs: Any
-    ) -> None:
-        super().__init__(*args, posterior=posterior, **kwargs)
-
     def _network(self, theta: Tensor, x: Tensor) -> RatioNetwork:
         assert self._action_dim is not None
         return RatioNetwork(self._action_estimator, theta, x, self._action_dim)
@@ -359,8 +292,3 @@ class SeqBED(ProductRounds, NRE_C):
                 stacklevel=2,
             )
         return super().arrange(theta, action)
-
-    @extends(NRE_C.train)
-    def train(self, *args: Any, **kwargs: Any) -> Any:
-        """Train the classifier, see :meth:`.ActionRounds.train`."""
-        return super().train(*args, **kwargs)
