@@ -89,7 +89,7 @@ class Design:
     @cached_property  # not a property: designs that were stored have it as a field
     def name(self) -> str:
         """Former name of the label, where there is one."""
-        warn("SA701 Design.name goes in the next version: use labels", stacklevel=2)
+        warn("SA701 Design.name goes in the next version: use labels")
         return self.labels[0] if len(self.labels) == 1 else "action"
 
     @property

@@ -118,8 +118,7 @@ def warn_of_idle(
         warn(
             f"SA303 {', '.join(idle)} change nothing that is read in {len(middle)} of "
             f"{where}: no such trial tells of them; leave them out, or read another "
-            "sensor",
-            stacklevel=5,
+            "sensor"
         )
 
 

@@ -162,8 +162,5 @@ class Diagnostics:
         return self._as_dict(f".get({name!r})").get(name, default)
 
     def _as_dict(self, used: str) -> dict[str, Any]:
-        warn(
-            f"SA701 diagnostics{used} is deprecated; use an attribute, or to_dict()",
-            stacklevel=3,
-        )
+        warn(f"SA701 diagnostics{used} is deprecated; use an attribute, or to_dict()")
         return self.to_dict()

@@ -54,7 +54,9 @@ class Enumeration:
             return None
         sizes = [int(size) for size in prior.dims_per_dist]
         columns = torch.arange(sum(sizes)).split(sizes)
-        parts = [*zip(prior.dists, columns, map(_values, prior.dists), strict=True)]
+        parts: list[Any] = [
+            *zip(prior.dists, columns, map(_values, prior.dists), strict=True)
+        ]
         chosen = [part for part in parts if part[2] is not None]
         rest = [part for part in parts if part[2] is None]
         axes = [own for _, at, own in chosen for _ in at]

@@ -277,22 +277,13 @@ def _solved(
     which: Tensor,
     right: Tensor,
     *,
-    few: int = 12,
     most_factors: int = 10_000_000,
 ) -> Tensor:
     """Return solutions (..., d) of upper factors [row, which] for right sides.
 
-    Beyond a few dimensions a factor serves many draws; otherwise, as in ``prepare``, so
-    many numbers of the factors are in memory at once, 40 MB.
+    As in ``prepare``, so many numbers of the factors are in memory at once, 40 MB.
     """
-    dim = right.shape[-1]
-    if len(factor) == 1 and dim > few:
-        found = torch.empty_like(right)
-        for k, own in enumerate(factor[0]):
-            at = which == k
-            found[at] = torch.linalg.solve_triangular(own, right[at].mT, upper=True).mT
-        return found
-    most = max(1, most_factors // (row[0].numel() * dim**2))
+    most = max(1, most_factors // (row[0].numel() * right.shape[-1] ** 2))
     parts = [part.split(most) for part in (row, which, right[..., None])]
     solve = torch.linalg.solve_triangular
     steps = [solve(factor[r, k], e, upper=True) for r, k, e in zip(*parts, strict=True)]

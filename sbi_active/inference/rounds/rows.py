@@ -109,8 +109,7 @@ def round_rows(
     warn(
         f"SA302 dropping {int(invalid.sum())} of {len(x)} simulations without a "
         "measurement: information gain is then biased towards actions that fail. The "
-        "default MixtureDensity network keeps them.",
-        stacklevel=4,
+        "default MixtureDensity network keeps them."
     )
     return rows.at(~invalid)
 
@@ -142,23 +141,19 @@ def check_proposal(proposal: Any, belief: Distribution | None) -> None:
     )
 
 
-def warn_missing(
-    num_missing: int, num_simulations: int, left_out: str, *, stacklevel: int
-) -> None:
+def warn_missing(num_missing: int, num_simulations: int, left_out: str) -> None:
     """Warn that faults of a simulator took some of a refinement's simulations.
 
     Args:
         num_missing: Number of those.
         num_simulations: Number of all.
         left_out: What was left out, as the end of a sentence.
-        stacklevel: Stack level of the warning where it is raised.
     """
     if num_missing:
         warn(
             f"SA301 {num_missing} of {num_simulations} simulations of the refinement "
             f"are missing, by faults of the simulator; {left_out} were left out",
             MissingRowsWarning,
-            stacklevel=stacklevel + 1,
         )
 
 

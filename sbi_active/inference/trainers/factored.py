@@ -272,8 +272,7 @@ class SeqBED(ProductRounds, NRE_C):
         if isinstance(classifier, LFIRE) or LFIRE_KEYWORDS & {*kwargs}:
             warn(
                 "SA701 sbi_active.SeqBED of logistic regressions goes in the next "
-                "version: use sbi_active.inference.SeqBED_LFIRE",
-                stacklevel=2,
+                "version: use sbi_active.inference.SeqBED_LFIRE"
             )
             return SeqBED_LFIRE(*args, **kwargs)  # pyright: ignore[reportReturnType]
         made = super().__new__(cls)
@@ -289,6 +288,5 @@ class SeqBED(ProductRounds, NRE_C):
                 "use sbi_active.inference.SeqBED_LFIRE(prior), and for this one pass "
                 "SeqBED(prior, RatioClassifier())",
                 ChangedWarning,
-                stacklevel=2,
             )
         return super().arrange(theta, action)
