@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 from torch.distributions import Distribution
 
+from sbi_active.arrays import finite
 from sbi_active.expected import require
 from sbi_active.inference.beliefs.belief import (
     Belief,
@@ -23,9 +24,11 @@ from sbi_active.inference.declared.settings import RefinementOptions
 from sbi_active.inference.engine.learned import LearnedBelief
 from sbi_active.inference.refinement.refining import refine
 from sbi_active.inference.rounds.condition import action_rows, outcome_rows
-from sbi_active.inference.rounds.rows import Observation, round_rows
+from sbi_active.inference.rounds.rows import Observation, UnexplainedOutcomeError
+from sbi_active.messages import warn
 from sbi_active.seeding import forked_generators, kept_generators
 from sbi_active.simulation.outcomes import Simulations
+from sbi_active.support import parameter_dim, within_support
 
 
 def is_finite_somewhere(
@@ -249,17 +252,48 @@ class ActiveInference(ABC):
         *,
         exclude_invalid: bool,
     ) -> tuple[Simulations, bool]:
-        """Return checked rows of a belief, and whether they begin another round."""
-        rows = round_rows(
-            theta,
-            x,
-            action,
-            prior=require_support(self._prior),
-            x_shape=self._outcome_shape,
-            action_dim=self._action_dim,
-            exclude_invalid=exclude_invalid,
-            may_be_invalid=bool(self.trials),
+        """Return checked rows of a belief in float32, and whether a round begins.
+
+        Outcomes may be gigabytes: who keeps them makes a copy. That no row has a
+        measurement is plausible under a belief from trials that had none.
+        """
+        prior = require_support(self._prior)
+        theta = torch.as_tensor(theta, dtype=torch.float32).clone()
+        x = torch.as_tensor(x)
+        x = x[:, None] if x.ndim == 1 else x
+        dim = parameter_dim(prior)
+        require(
+            theta.ndim == 2 and theta.shape[1] == dim and len(x) == len(theta),
+            f"theta (n, {dim}) and x (n, ...) with as many rows",
+            f"{tuple(theta.shape)} and {tuple(x.shape)}",
+            "give one row a simulation",
         )
+        outside = ~within_support(prior, theta)
+        if bool(outside.any()):
+            row = int(outside.nonzero()[0])
+            raise ValueError(
+                "expected theta within the prior's support; got "
+                f"{int(outside.sum())} of {len(theta)} rows outside, the first "
+                f"{theta[row].tolist()} in row {row}; sample theta from the belief"
+            )
+        x = outcome_rows(x, self._outcome_shape or x.shape[1:], copy=False)
+        action = action_rows(action, self._action_dim, num_rows=len(theta))
+        rows = Simulations(theta, action, x)
+        present = finite(x.flatten(1))
+        invalid = ~(present.all(-1) if exclude_invalid else present.any(-1))
+        if bool(invalid.all()) and (exclude_invalid or not self.trials):
+            raise UnexplainedOutcomeError(
+                f"expected at least one simulation with a measurement; got {len(x)} of "
+                f"{len(x)} invalid (NaN or inf); check the simulator at theta = "
+                f"{theta[0].tolist()}, action = {action[0].tolist()}"
+            )
+        if exclude_invalid and bool(invalid.any()):
+            warn(
+                f"SA302 dropping {int(invalid.sum())} of {len(x)} simulations without "
+                "a measurement: information gain is then biased towards actions that "
+                "fail. The default MixtureDensity network keeps them."
+            )
+            rows = rows.at(~invalid)
         self._outcome_shape, self._action_dim = rows.x.shape[1:], rows.action.shape[1]
         belief = self.belief if belief is None else belief
         is_new = belief is not self._round_belief
