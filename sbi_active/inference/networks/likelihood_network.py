@@ -87,29 +87,38 @@ class LikelihoodNetwork(ConditionalDensityEstimator):
         return nn.Identity()
 
     def prepare(self, condition: Tensor, x: Tensor) -> tuple[Tensor, Tensor]:
-        """Return residuals, zero without a measurement and whether, and conditions."""
+        """Return rows for :meth:`prepared_loss`: all that no weight changes."""
         valid = x.isfinite().all(-1, keepdim=True)
         with torch.no_grad():
             known = torch.where(valid, x.double(), self.y_mean)
-            z, _ = self._standardize(known, condition)
-            return torch.cat([z, valid], 1).float(), self._see(condition)
+            z, seen = (
+                self._standardize(known, condition)[0].float(),
+                self._see(condition),
+            )
+            prepared, inputs = self.mixture.prepare(z, seen)
+            parts = [prepared, log_normal(z)[:, None], valid]
+            return torch.cat(parts, 1), torch.cat([inputs, seen], 1)
 
-    def prepared_loss(self, prepared: Tensor, seen: Tensor) -> Tensor:
+    def prepared_loss(self, prepared: Tensor, inputs: Tensor) -> Tensor:
         """Return -log q but for the regression's constant, shape (n,)."""
-        z, valid = prepared.tensor_split([-1], 1)
-        log_density = -self.mixture.loss(z, seen)
-        return -self._of_all(log_density, valid[..., 0] > 0, seen)
+        log_density, _, valid = self._densities(prepared, inputs)
+        return -self._of_all(log_density, valid, inputs.chunk(2, 1)[1])
 
-    def choose(self, prepared: Tensor, seen: Tensor) -> None:
+    def choose(self, prepared: Tensor, inputs: Tensor) -> None:
         """Take the standard normal density unless the mixture does better held out."""
-        residual, valid = prepared.tensor_split([-1], 1)
-        known = valid[:, 0] > 0
-        if self.response is None or not bool(known.any()):
-            return
-        residual, seen = residual[known], seen[known]
         with torch.no_grad():
-            gain = -self.mixture.loss(residual, seen) - log_normal(residual)
-            self.is_gaussian.fill_(not exceeds_chance(gain.double()))
+            log_density, log_plain, valid = self._densities(prepared, inputs)
+        if self.response is not None and bool(valid.any()):
+            gain = (log_density - log_plain)[valid].double()
+            self.is_gaussian.fill_(not exceeds_chance(gain))
+
+    def _densities(
+        self, prepared: Tensor, inputs: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Return log densities of residuals, those of a normal, and whether valid."""
+        prepared, log_plain, valid = prepared.tensor_split([-2, -1], 1)
+        loss = self.mixture.prepared_loss(prepared, inputs.chunk(2, 1)[0])
+        return -loss, log_plain[:, 0], valid[:, 0] > 0
 
     def loss(self, input: Tensor, condition: Tensor, **kwargs: object) -> Tensor:
         """Return -log q, shape (n,), for rows (n, x_dim) and (n, condition_dim)."""
