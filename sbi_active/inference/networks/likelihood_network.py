@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 import math
+import warnings
 from dataclasses import replace
 
 import torch
 from sbi.neural_nets.estimators.base import ConditionalDensityEstimator
+from sklearn.neural_network import MLPClassifier
 from torch import Tensor, nn
-from torch.nn.functional import logsigmoid
 from typing_extensions import override
 
 from sbi_active.inference.networks.conditioning import Whitening, can_regress, moments
 from sbi_active.inference.networks.mixture_density import MixtureDensity
-from sbi_active.inference.networks.mixture_network import layers, log_prob_of_batch
+from sbi_active.inference.networks.mixture_network import log_prob_of_batch
 from sbi_active.inference.networks.response import Response, exceeds_chance, log_normal
 
 
@@ -27,7 +28,7 @@ class LikelihoodNetwork(ConditionalDensityEstimator):
     with f and the noise's whitener W from a :class:`.Response` and m a mixture density
     network on the residual, or the standard normal density where that predicts held-out
     rows as well: the network corrects the regression where that pays. An outcome of NaN
-    has the probability :math:`1 - P_\text{valid}`, of a network with a logistic output.
+    has the probability :math:`1 - P_\text{valid}`, of a network's logistic output.
     Without a regression, W and f standardize x over all rows.
 
     Args:
@@ -72,12 +73,14 @@ class LikelihoodNetwork(ConditionalDensityEstimator):
         # The action's place matters to the regression alone.
         plain = replace(settings, details=replace(settings.details, baseline="none"))
         self.mixture = plain(residual.float(), seen[valid])
-        self.validity: nn.Sequential | None = None
+        self.validity: MLPClassifier | None = None
         if not bool(valid.all()):
-            self.validity = layers(seen.shape[1], (width,), 1, nn.Tanh)
-            share = valid.double().mean().clamp(1e-3, 1 - 1e-3)
-            with torch.no_grad():  # start at the share of valid rows
-                self.validity[-1].bias.fill_(float(share.logit()))  # pyright: ignore
+            # A prior of weights of one keeps the edge soft where few rows are invalid.
+            how = {"solver": "lbfgs", "alpha": 1.0, "max_iter": 300, "random_state": 0}
+            network = MLPClassifier((width,), "tanh", **how)
+            with warnings.catch_warnings():  # of iterations that end it
+                warnings.simplefilter("ignore")
+                self.validity = network.fit(seen.cpu().numpy(), valid.cpu().numpy())
         self._log_unseen = -math.log(len(x) + 2)
         self.is_gaussian = nn.Buffer(torch.tensor(False))
 
@@ -91,18 +94,14 @@ class LikelihoodNetwork(ConditionalDensityEstimator):
         valid = x.isfinite().all(-1, keepdim=True)
         with torch.no_grad():
             known = torch.where(valid, x.double(), self.y_mean)
-            z, seen = (
-                self._standardize(known, condition)[0].float(),
-                self._see(condition),
-            )
-            prepared, inputs = self.mixture.prepare(z, seen)
-            parts = [prepared, log_normal(z)[:, None], valid]
-            return torch.cat(parts, 1), torch.cat([inputs, seen], 1)
+            z = self._standardize(known, condition)[0].float()
+            prepared, inputs = self.mixture.prepare(z, self._see(condition))
+            return torch.cat([prepared, log_normal(z)[:, None], valid], 1), inputs
 
     def prepared_loss(self, prepared: Tensor, inputs: Tensor) -> Tensor:
-        """Return -log q but for the regression's constant, shape (n,)."""
+        """Return -log q of a measurement but for a constant, 0 without, shape (n,)."""
         log_density, _, valid = self._densities(prepared, inputs)
-        return -self._of_all(log_density, valid, inputs.chunk(2, 1)[1])
+        return -torch.where(valid, log_density, 0.0)
 
     def choose(self, prepared: Tensor, inputs: Tensor) -> None:
         """Take the standard normal density unless the mixture does better held out."""
@@ -117,7 +116,7 @@ class LikelihoodNetwork(ConditionalDensityEstimator):
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Return log densities of residuals, those of a normal, and whether valid."""
         prepared, log_plain, valid = prepared.tensor_split([-2, -1], 1)
-        loss = self.mixture.prepared_loss(prepared, inputs.chunk(2, 1)[0])
+        loss = self.mixture.prepared_loss(prepared, inputs)
         return -loss, log_plain[:, 0], valid[:, 0] > 0
 
     def loss(self, input: Tensor, condition: Tensor, **kwargs: object) -> Tensor:
@@ -152,7 +151,7 @@ class LikelihoodNetwork(ConditionalDensityEstimator):
         )
         x = (self.y_mean + self.y_scale * (mean + step[..., 0])).float()
         if self.validity is not None:
-            probability = self.validity(seen)[:, 0].sigmoid().expand(x.shape[:-1])
+            probability = self._log_shares(seen)[1].exp().expand(x.shape[:-1])
             x[torch.rand(probability.shape) > probability] = torch.nan
         return x
 
@@ -164,15 +163,19 @@ class LikelihoodNetwork(ConditionalDensityEstimator):
         z, seen = z.to(torch.float32), self._see(condition)
         is_normal = bool(self.is_gaussian)
         log_density = log_normal(z) if is_normal else self.mixture.log_prob(z, seen)
-        return self._of_all(log_density + log_det.to(log_density), valid, seen)
+        log_density = log_density + log_det.to(log_density)
+        log_invalid, log_valid = self._log_shares(seen)
+        return torch.where(valid, log_valid + log_density, log_invalid)
 
-    def _of_all(self, log_density: Tensor, valid: Tensor, seen: Tensor) -> Tensor:
-        """Return log q from that of measurements, or that there is none."""
+    def _log_shares(self, seen: Tensor) -> tuple[Tensor, Tensor]:
+        """Return log probabilities of no measurement and of one, each (n,)."""
         if self.validity is None:
             # No row lacked a measurement: that it is rare says nothing of where.
-            return torch.where(valid, log_density, self._log_unseen)
-        logit = self.validity(seen)[:, 0]
-        return torch.where(valid, logsigmoid(logit) + log_density, logsigmoid(-logit))
+            none = seen.new_zeros(len(seen))
+            return none + self._log_unseen, none
+        shares = self.validity.predict_log_proba(seen.detach().cpu().numpy())
+        shares = torch.from_numpy(shares).to(seen).clamp_min(-100.0)  # not -inf
+        return shares[:, 0], shares[:, 1]
 
     def _standardize(self, x: Tensor, condition: Tensor) -> tuple[Tensor, Tensor]:
         """Return residuals (..., n, x_dim) and log |dz / dx| (n,)."""
