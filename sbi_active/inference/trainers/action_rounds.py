@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import functools
-import inspect
 import warnings
 from abc import abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from contextlib import nullcontext
 from typing import Any, ClassVar
 
@@ -30,37 +28,9 @@ from sbi_active.inference.rounds.condition import pack
 from sbi_active.inference.rounds.rows import check_proposal, require_whole
 from sbi_active.inference.sampling.adam import Adam
 from sbi_active.inference.trainers.base import ActiveInference
+from sbi_active.inference.trainers.signatures import extended, given_arguments
 from sbi_active.simulation.outcomes import Simulations
 from sbi_active.threads import single_thread
-
-
-def _extended(ours: Callable[..., Any], theirs: Callable[..., Any]) -> Any:
-    """Return a method with the signature of sbi's, and keywords of its own after it."""
-
-    @functools.wraps(ours)
-    def call(*args: Any, **kwargs: Any) -> Any:
-        return ours(*args, **kwargs)
-
-    further = inspect.signature(ours).parameters.values()
-    own = [p for p in further if p.kind is inspect.Parameter.KEYWORD_ONLY]
-    known = inspect.signature(theirs).parameters.values()
-    call.__signature__ = inspect.Signature([*known, *own])  # pyright: ignore
-    return call
-
-
-def given_arguments(
-    method: Callable[..., Any], args: tuple[Any, ...], kwargs: Mapping[str, Any]
-) -> dict[str, Any]:
-    """Return by name the arguments that a call of a method of sbi's was given.
-
-    None stands for sbi's default, but as ``clip_max_norm``, where it says not to clip.
-    """
-    given = inspect.signature(method).bind(*args, **kwargs).arguments
-    return {
-        name: value
-        for name, value in given.items()
-        if value is not None or name == "clip_max_norm"
-    }
 
 
 class SilentTracker:
@@ -116,7 +86,7 @@ class ActionRounds(ActiveInference):
         theirs: Any = cls.__bases__[-1]
         if not issubclass(theirs, ActiveInference):
             for name in ("__init__", "append_simulations", "train"):
-                made = _extended(getattr(cls, name), getattr(theirs, name))
+                made = extended(getattr(cls, name), getattr(theirs, name))
                 setattr(cls, name, made)
 
     _theta_roundwise: list[Tensor]
