@@ -72,24 +72,7 @@ _PACKAGES = (
     *("mujoco", "simulation"),
 )
 
-_find = lazy_names(
-    __name__,
-    {
-        "ActionEmbedding": "sbi_active.inference:ActionEmbedding",
-        "ActionLikelihood": "sbi_active.inference.models.factors:ActionLikelihood",
-        "ActionPosterior": "sbi_active.inference:ActionPosterior",
-        "ActionRatio": "sbi_active.inference.models.factors:ActionRatio",
-        "ActionSpace": "sbi_active.actions:ActionSpace",
-        "ActiveInference": "sbi_active.inference:ActiveInference",
-        "Design": "sbi_active.design:Design",
-        "Refinement": "sbi_active:RefinementOptions",
-        "SeqBED_B": "sbi_active:SeqBED",
-        "SeqBED_C": "sbi_active:SeqBED",
-        "Simulations": "sbi_active.simulation:Simulations",
-        "Trial": "sbi_active.campaign:Trial",
-        "unknown_noise": "sbi_active:AutocorrelatedNoise.unknown",
-    },
-)
+_find = lazy_names(__name__)
 
 
 def __getattr__(name: str) -> Any:

@@ -73,9 +73,9 @@ def data_tree(groups: Groups) -> xr.DataTree:
     return tree
 
 
-def inference_data(groups: Groups) -> Any:
-    """Return InferenceData, or from ArviZ 1.0 on a DataTree."""
+def inference_data(tree: xr.DataTree) -> Any:
+    """Return InferenceData, or from ArviZ 1.0 on the tree itself."""
     if int(az.__version__.split(".")[0]) >= 1:
-        return data_tree(groups)
-    datasets: dict[str, Any] = groups.datasets()
-    return az.InferenceData(**datasets)
+        return tree
+    groups: dict[str, Any] = {k: v.to_dataset() for k, v in tree.children.items()}
+    return az.InferenceData(**groups)

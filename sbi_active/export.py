@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
+import xarray as xr
 from torch import Tensor
 from torch.distributions import Distribution
 
@@ -19,12 +20,11 @@ from sbi_active.simulation import simulate
 if TYPE_CHECKING:
     from sbi_active.actions import ActionSpace
     from sbi_active.campaign import Campaign
-    from sbi_active.criticism import Report
 
 
 @suggests
-def to_inference_data(
-    source: Distribution | Campaign | Report | Mapping[str, Any],
+def to_datatree(
+    source: Any,
     *,
     parameter_names: Sequence[str] | None = None,
     num_samples: int = 2_000,
@@ -34,8 +34,11 @@ def to_inference_data(
     action: Tensor | None = None,
     x: Tensor | None = None,
     seed: int = 0,
-) -> Any:
-    """Return draws and data in ArviZ's format.
+) -> xr.DataTree:
+    """Return draws and data as an xarray ``DataTree``, which ArviZ 1.x takes.
+
+    It needs xarray alone, so that one Python may write what another one reads: by
+    ``to_netcdf``, or ``to_zarr``.
 
     Groups of a belief: posterior, sample_stats (the log density ``lp`` of each draw),
     and prior where the belief knows it; with ``simulator`` and ``action`` also
@@ -44,15 +47,14 @@ def to_inference_data(
     constant_data (actions) and log_likelihood (where the simulator's noise has a
     density); the predictive ones and the likelihood where it was loaded with its
     simulator, without which ``lp`` is by kernels where it would be simulated. A report
-    has the posterior of its verdict's model, or of ``model``. A benchmark run is a dict
-    of variables, each of shape (draws,) or (draws, parameters): its rows as draws.
+    has the posterior of its verdict's model, or of ``model``.
 
     Draws are independent; they are split over chains, so that r_hat and ess are
     defined. Coordinates name parameters, rounds, channels and entries of the action,
     which carry their units as attributes.
 
     Args:
-        source: A belief, a campaign, a report, or a dict of arrays.
+        source: A belief, a campaign or a report.
         parameter_names: Names of the parameters; None takes the simulator's, which
             beliefs remember, else theta_1, ...
         num_samples: Draws of all chains together.
@@ -64,78 +66,16 @@ def to_inference_data(
             log_likelihood where the simulator declares its noise.
         seed: Seed of the draws.
 
-    Returns:
-        ``InferenceData`` of ArviZ 0.x, ``DataTree`` of 1.x.
-
     Raises:
         ValueError: If names do not fit, chains are more than half of the draws, a
             report has no such model, or actions come without a simulator or not with a
             belief.
-
-    Example:
-        >>> from sbi.utils import BoxUniform
-        >>> data = to_inference_data(BoxUniform(torch.zeros(2), torch.ones(2)))
-        >>> data["posterior"]["theta"].dims
-        ('chain', 'draw', 'parameter')
     """
-    tried = simulator, action, x
-    return inference_data(
-        _groups(source, parameter_names, num_samples, num_chains, model, tried, seed)
-    )
-
-
-@suggests
-def to_datatree(
-    source: Distribution | Campaign | Report | Mapping[str, Any],
-    *,
-    parameter_names: Sequence[str] | None = None,
-    num_samples: int = 2_000,
-    num_chains: int = 4,
-    model: str | None = None,
-    simulator: Callable[..., Any] | None = None,
-    action: Tensor | None = None,
-    x: Tensor | None = None,
-    seed: int = 0,
-) -> Any:
-    """Return draws and data as an xarray ``DataTree``, which ArviZ 1.x takes.
-
-    It needs xarray alone, so that one Python may write what another one reads: by
-    ``to_netcdf``, or ``to_zarr``.
-
-    Args:
-        source: Belief, campaign, report or dict of arrays, as for
-            :func:`to_inference_data`.
-        parameter_names: Names of the parameters.
-        num_samples: Draws of all chains together.
-        num_chains: Number of chains.
-        model: Model of a report, by its name.
-        simulator: Simulator that a belief predicts with, as for
-            :func:`to_inference_data`.
-        action: Actions at which it does.
-        x: Outcomes measured there.
-        seed: Seed of the draws.
-    """
-    tried = simulator, action, x
-    return data_tree(
-        _groups(source, parameter_names, num_samples, num_chains, model, tried, seed)
-    )
-
-
-def _groups(
-    source: Any,
-    names: Sequence[str] | None,
-    num_samples: int,
-    num_chains: int,
-    model: str | None,
-    tried: tuple[Any, Any, Any],
-    seed: int,
-) -> Groups:
     if not 1 <= num_chains <= num_samples // 2:
         raise ValueError(
             "expected at least two draws a chain; got "
             f"{num_samples} draws in {num_chains} chains; raise num_samples"
         )
-    simulator, action, x = tried
     is_belief = isinstance(source, Distribution)
     if (simulator is None) != (action is None) or (action is not None) > is_belief:
         raise ValueError(
@@ -145,29 +85,45 @@ def _groups(
         )
     made = Groups(num_chains)
     num_samples -= num_samples % num_chains
-    if isinstance(source, Mapping):
-        _add_rows(made, source)
-    elif hasattr(source, "tracing"):
+    if hasattr(source, "tracing"):
         _add_report(made, source, num_samples, model, seed)
     elif is_belief:
         prior = getattr(source, "prior", None)
-        draws = _add_belief(made, source, prior, names, num_samples, seed)
+        draws = _add_belief(made, source, prior, parameter_names, num_samples, seed)
         if action is not None:
             made.coords["round"] = [*range(1, len(action) + 1)]
             _add_outcomes(made, simulator, draws, action, x, seed)
     elif hasattr(source, "history"):
-        if names is None:
-            names = source.parameter_names
+        names = parameter_names or source.parameter_names
         pair = source.belief, source.prior
         reads = source.simulator is None
         draws = _add_belief(made, *pair, names, num_samples, seed, is_smooth=reads)
         _add_trials(made, source, draws, seed)
     else:
         raise TypeError(
-            "expected a belief, a campaign, a report or a dict of arrays; got "
+            "expected a belief, a campaign or a report; got "
             f"{type(source).__name__}; pass one of these"
         )
-    return made
+    return data_tree(made)
+
+
+def to_inference_data(source: Any, **options: Any) -> Any:
+    """Return draws and data in ArviZ's format.
+
+    Args:
+        source: A belief, a campaign or a report.
+        options: Options of :func:`to_datatree`, which says what is in which group.
+
+    Returns:
+        ``InferenceData`` of ArviZ 0.x, ``DataTree`` of 1.x.
+
+    Example:
+        >>> from sbi.utils import BoxUniform
+        >>> data = to_inference_data(BoxUniform(torch.zeros(2), torch.ones(2)))
+        >>> data["posterior"]["theta"].dims
+        ('chain', 'draw', 'parameter')
+    """
+    return inference_data(to_datatree(source, **options))
 
 
 def _add_belief(
@@ -375,20 +331,3 @@ def _rival_log_likelihood(report: Any, found: Any, draws: np.ndarray) -> Any:
             mean = simulator.mean(*given)
         terms.append(noise.log_prob(x[k].expand(mean.shape), mean.double()))
     return torch.stack(terms, 1)
-
-
-def _add_rows(made: Groups, rows: Mapping[str, Any]) -> None:
-    """Add a benchmark's rows as draws; texts are left out."""
-    for name, values in rows.items():
-        array = np.asarray(values)
-        if array.dtype.kind not in "biuf" or array.ndim == 0:
-            continue
-        if len(array) < 2 * made.num_chains:
-            raise ValueError(
-                f"expected at least {2 * made.num_chains} rows; got {len(array)}; lower"
-                " num_chains"
-            )
-        dims = [f"{name}_dim_{i}" for i in range(array.ndim - 1)]
-        made.add("posterior", str(name), array.astype(float), dims)
-    if not made.variables:
-        raise ValueError("expected columns of numbers; got none; pass arrays of rows")

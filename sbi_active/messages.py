@@ -10,13 +10,13 @@ was given and what to do.
 from __future__ import annotations
 
 import re
+import sys
 import warnings
 from functools import cache
 from pathlib import Path
 
-from sbi_active.callers import stack_level
-
 _ENTRY = re.compile(r"^### (SA\d+) (.+)\n((?:.+\n)+)", re.MULTILINE)
+_PACKAGE = f"{Path(__file__).parent}/"
 _CODE = re.compile(r"\((SA\d+)\)$")
 #: How messages ended in earlier versions, with or without the number.
 _FORMER = re.compile(r"\(see warnings\.html#(?:sa(\d+)-)?([\w-]+)\)$")
@@ -135,22 +135,16 @@ def place(code: str) -> str:
     return f" ({code})"
 
 
-def warn(
-    text: str,
-    category: type[SBIActiveWarning] | None = None,
-    *,
-    stacklevel: int | None = None,
-) -> None:
-    """Warn as :func:`warnings.warn` does, with the code of the message.
+def warn(text: str, category: type[SBIActiveWarning] | None = None) -> None:
+    """Warn at the line that called the package, with the code of the message.
 
     Args:
         text: Code, what is wrong and what to do.
         category: Class of the warning; None takes that of the code.
-        stacklevel: 1 for the line that calls this, 2 for who called its function; None
-            is the line that called the package.
     """
-    said = Message(text)
-    level = stack_level() if stacklevel is None else stacklevel + 1
+    frame, level, said = sys._getframe(), 1, Message(text)
+    while frame.f_back is not None and frame.f_code.co_filename.startswith(_PACKAGE):
+        frame, level = frame.f_back, level + 1
     warnings.warn(said, category or said.category, stacklevel=level)
 
 

@@ -1,6 +1,7 @@
 """Names of packages: imported when they are used, and those of the last version.
 
-Former names and keywords still work, and a warning gives the new ones.
+Former names, listed in ``renamed.txt`` beside this file, and former keywords still
+work, and a warning gives the new ones.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ import pkgutil
 import sys
 from collections.abc import Callable, Mapping
 from dataclasses import fields, replace
+from pathlib import Path
 from typing import Any, TypeVar
 
 from sbi_active.expected import suggests
@@ -19,39 +21,37 @@ from sbi_active.messages import warn
 Taking = TypeVar("Taking", bound=Callable[..., Any])
 
 
-def former_names(package: str, names: Mapping[str, str]) -> Callable[[str], Any]:
+@functools.cache
+def former() -> dict[str, str]:
+    """Return where names of the last version are now, as ``"package:Name"``."""
+    text = Path(__file__).with_suffix(".txt").read_text(encoding="utf-8")
+    return dict(line.split(" = ") for line in text.splitlines())
+
+
+def former_names(package: str) -> Callable[[str], Any]:
     """Return a ``__getattr__`` of a package that finds its former names.
 
-    Args:
-        package: Name of the package.
-        names: Former name: where it is now, as ``"package:Name"``.
-
-    Returns:
-        A function of a name. It raises AttributeError for names that never were.
+    It raises AttributeError for names that never were.
     """
 
     def find(name: str) -> Any:
-        if name not in names:
+        now = former().get(f"{package}.{name}")
+        if now is None:
             raise AttributeError(f"module {package!r} has no attribute {name!r}")
-        home, _, new = names[name].partition(":")
-        warn(f"SA701 {package}.{name} goes in the next version: use {home}.{new}")
-        return pkgutil.resolve_name(names[name])
+        new = now.replace(":", ".")
+        warn(f"SA701 {package}.{name} goes in the next version: use {new}")
+        return pkgutil.resolve_name(now)
 
     return find
 
 
-def lazy_names(
-    package: str, former: Mapping[str, str] | None = None
-) -> Callable[[str], Any]:
+def lazy_names(package: str) -> Callable[[str], Any]:
     """Return a ``__getattr__`` of a package that imports a name when it is used.
 
     A package then costs nothing where only a module of it is wanted that needs little.
     The names, and where they come from, are the imports that the package's file has
-    under ``if TYPE_CHECKING``, which type checkers read as well.
-
-    Args:
-        package: Name of the package.
-        former: Former names, see :func:`former_names`.
+    under ``if TYPE_CHECKING``, which type checkers read as well. Former names are found
+    as by :func:`former_names`.
     """
     loader: Any = getattr(sys.modules[package].__spec__, "loader", None)
     tree = ast.parse(loader.get_source(package))  # of a zipped package as well
@@ -63,7 +63,7 @@ def lazy_names(
         if isinstance(line, ast.ImportFrom)
         for alias in line.names
     }
-    find_former = former_names(package, former or {})
+    find_former = former_names(package)
 
     def find(name: str) -> Any:
         if name not in home:

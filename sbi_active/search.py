@@ -4,13 +4,4 @@ from sbi_active.renamed import former_names
 
 __all__: list[str] = []
 
-__getattr__ = former_names(
-    __name__,
-    {
-        "BayesianOptimization": "sbi_active.design:GradientSearch",
-        "Evaluations": "sbi_active.design.search:Evaluations",
-        "GradientSearch": "sbi_active.design:GradientSearch",
-        "Objective": "sbi_active.design.search:Objective",
-        "Search": "sbi_active.design:Search",
-    },
-)
+__getattr__ = former_names(__name__)

@@ -165,12 +165,7 @@ def test_a_rival_has_the_posterior_that_its_densities_go_with(report):
     assert len(np.unique(draws)) > 0.9 * len(draws)  # a resample repeats its points
 
 
-def test_rows_of_a_benchmark_and_a_tree(campaign, tmp_path):
-    data = to_inference_data({"gap": np.arange(40.0), "task": ["a"] * 40})
-    assert data.posterior.gap.shape == (4, 10)
-    assert [*data.posterior.data_vars] == ["gap"]
-    with pytest.raises(ValueError, match="at least 8 rows"):
-        to_inference_data({"gap": np.arange(5.0)})
+def test_a_tree_is_read_again(campaign, tmp_path):
     with pytest.raises(TypeError, match="got float"):
         to_inference_data(1.0)
     tree = to_datatree(campaign, num_samples=40)

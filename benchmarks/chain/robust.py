@@ -40,7 +40,7 @@ def judged(seed: int, case: str, method: str) -> dict[str, Any]:
     inference = METHODS[method](task.prior)
     chosen = task.actions.sample((NUM_TRIALS,), seed=derive_seed(seed, "trials"))
     belief, flagged, others, r_hat = task.prior, 0.0, [], 1.0
-    ess, divergences = float("inf"), 0
+    ess = float("inf")
     start = time.process_time()
     for i, action in enumerate(chosen):
         own = derive_seed(seed, "round", i)
@@ -61,7 +61,6 @@ def judged(seed: int, case: str, method: str) -> dict[str, Any]:
             found = inference.denoised[-1]
             r_hat = max(r_hat, found.r_hat)
             ess = min(ess, found.effective_sample_size)
-            divergences += found.num_divergences
             if is_off:
                 flagged = float(found.probability[0])
             else:
@@ -74,7 +73,6 @@ def judged(seed: int, case: str, method: str) -> dict[str, Any]:
         "probability_others": max(others, default=0.0),
         "largest_r_hat": r_hat,
         "least_effective": ess,
-        "divergences": divergences,
         "cpu_s": time.process_time() - start,
     }
 
@@ -99,13 +97,12 @@ def summary(rows: pd.DataFrame) -> str:
                 f"{own['probability_others'].max():.2f}",
                 f"{r_hat.median():.2f} ({r_hat.max():.2f})",
                 f"{own['least_effective'].min():.0f}",
-                f"{own['divergences'].sum():.0f}",
                 *(f"{cost[m]:.0f}" for m in METHODS),
             ]
         )
     header = ["case", "seeds", "median gain", "least to most, nats", "P(outlier)"]
     header += ["largest P of others", "largest r_hat: median (most)"]
-    header += ["least effective draws", "divergences"]
+    header += ["least effective draws"]
     return Table([*header, *(f"CPU s, {m}" for m in METHODS)], lines).text()
 
 

@@ -41,7 +41,7 @@ from benchmarks.numerical.run import (
 )
 from benchmarks.numerical.run import run_trial as by_round
 from benchmarks.rows import benchmark, column, grouped, published
-from sbi_active import Campaign, CampaignOptions, RefinementOptions
+from sbi_active import Campaign, CampaignOptions
 from sbi_active.campaign.learning.methods import METHODS
 from sbi_active.campaign.options import CampaignDetails
 from sbi_active.display.table import Table
@@ -52,9 +52,6 @@ from sbi_active.tasks import Task
 NUM_COMPARED = 1_000  # draws of each in the classifier test
 #: Of a round in the faithful setting, and in the default one for designing alone.
 NUM_FAITHFUL, NUM_DESIGN = 52_000, 15_700
-#: Parameters in a refinement, so that methods that spend all of them, at each executed
-#: action, spend what ASBI's, which stops by itself, does on average.
-HISTORIES = RefinementOptions(num_histories=600)
 
 
 _ALHI: dict[str, Any] = {
@@ -89,8 +86,6 @@ def options_of(setting: str, method: str) -> CampaignOptions:
         options = replace(CampaignOptions.faithful(), **FAITHFUL[method])
         return options if designs else replace(options, num_simulations=NUM_FAITHFUL)
     options = CampaignOptions()
-    if method not in ("asbi", "nsbi"):
-        options = replace(options, refinement=HISTORIES)
     if not designs:
         num = options.num_simulations + NUM_DESIGN
         options = replace(options, num_simulations=num)

@@ -18,10 +18,4 @@ if TYPE_CHECKING:
 
 __all__ = ["Campaign", "CampaignOptions", "StopRules", "Trial"]
 
-__getattr__ = lazy_names(
-    __name__,
-    {
-        "CampaignState": "sbi_active.campaign.state:CampaignState",
-        "ModelVersion": "sbi_active.campaign.state:ModelVersion",
-    },
-)
+__getattr__ = lazy_names(__name__)

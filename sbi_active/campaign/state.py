@@ -134,7 +134,7 @@ class Trial:
     @cached_property  # not a property: trials that were stored have it as a field
     def network_used_by(self) -> tuple[str, ...]:
         """Former users of this round's network, no longer written down."""
-        warn("SA701 Trial.network_used_by goes in the next version", stacklevel=2)
+        warn("SA701 Trial.network_used_by goes in the next version")
         return ()
 
     @property

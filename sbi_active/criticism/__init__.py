@@ -32,17 +32,4 @@ __all__ = [
     "varying_parameters",
 ]
 
-__getattr__ = former_names(
-    __name__,
-    {
-        "Detection": "sbi_active.criticism.results:Detection",
-        "Estimate": "sbi_active.criticism.results:Estimate",
-        "Evaluation": "sbi_active.criticism.results:Evaluation",
-        "Evidence": "sbi_active.criticism.results:Evidence",
-        "JointPrior": "sbi_active.criticism.effects:JointPrior",
-        "NextAction": "sbi_active.criticism.results:NextAction",
-        "Residuals": "sbi_active.criticism.results:Residuals",
-        "SevereTest": "sbi_active.criticism.contradictions:SevereTest",
-        "Tracing": "sbi_active.criticism.results:Tracing",
-    },
-)
+__getattr__ = former_names(__name__)

@@ -10,11 +10,4 @@ from sbi_active.renamed import former_names
 
 __all__ = ["check_belief", "check_calibration"]
 
-__getattr__ = former_names(
-    __name__,
-    {
-        "BeliefCheck": "sbi_active.diagnostics.beliefs:BeliefCheck",
-        "Calibration": "sbi_active.diagnostics.calibration:Calibration",
-        "Stratum": "sbi_active.diagnostics.calibration:Stratum",
-    },
-)
+__getattr__ = former_names(__name__)

@@ -150,25 +150,6 @@ def worst(verdicts: Sequence[Verdict]) -> Verdict:
     return order[max((order.index(v) for v in verdicts), default=0)]
 
 
-@dataclass(frozen=True, kw_only=True)
-class Tolerance:
-    """Tolerances of a verdict.
-
-    Attributes:
-        coverage: Error of the coverage of the 90 % regions.
-        excluded: Shortfall of that coverage beyond which the verdict is "stop".
-        rank_distance: Distance of the ranks' distribution from uniform.
-        lost: Share of what outcomes tell.
-        gap: Nats below which no share counts.
-    """
-
-    coverage: float = 0.05
-    excluded: float = 0.1
-    rank_distance: float = 0.08
-    lost: float = 0.4
-    gap: float = 0.1
-
-
 def judge(
     stratum: str,
     ranks: Tensor,
@@ -177,9 +158,13 @@ def judge(
     *,
     num_posterior_samples: int,
     level: float,
-    tolerance: Tolerance,
     names: Sequence[str],
     num_kinds: int = 4,
+    off: float = 0.05,
+    excluded: float = 0.1,
+    uneven: float = 0.08,
+    lost: float = 0.4,
+    small: float = 0.1,
 ) -> Stratum:
     r"""Return the figures of a stratum.
 
@@ -190,9 +175,13 @@ def judge(
         gained: log q - log b at the truths, shape (n,), nats.
         num_posterior_samples: Number of posterior draws L.
         level: Level of error of one stratum, shared among its figures.
-        tolerance: Tolerance of the figures.
         names: Names of the parameters.
         num_kinds: Number of kinds of figures beside the ranks of each parameter.
+        off: Error of the coverage of the 90 % regions that is tolerated.
+        excluded: Shortfall of that coverage beyond which the verdict is "stop".
+        uneven: Distance of the ranks' distribution from uniform that is tolerated.
+        lost: Share of what outcomes tell that may be lost.
+        small: Nats below which no share counts.
     """
     n, dim = len(ranks), ranks.shape[1] - 1
     each = level / (num_kinds + dim)
@@ -205,24 +194,24 @@ def judge(
     margin = math.sqrt(math.log(2 / each) / (2 * n))
     mean = float(gap.mean())
     information = float((gap + gained).mean())
-    excess = gap - tolerance.lost * (gap + gained).clamp_min(-20)
+    excess = gap - lost * (gap + gained).clamp_min(-20)
     reasons: list[tuple[Verdict, str]] = []
     text = f"90 % regions hold {inside / n:.0%} of the truths, at"
-    if high < 0.9 - tolerance.excluded:
+    if high < 0.9 - excluded:
         word = f"most {high:.0%}: it excludes the truth too often"
         reasons.append(("stop", f"{text} {word}"))
-    elif high < 0.9 - tolerance.coverage:
+    elif high < 0.9 - off:
         reasons.append(("refine", f"{text} most {high:.0%}: it is too sure"))
-    elif low > 0.9 + tolerance.coverage:
+    elif low > 0.9 + off:
         reasons.append(("refine", f"{text} least {low:.0%}: it is too wide"))
-    for name, off in zip(names, distance, strict=True):
-        if off - margin > tolerance.rank_distance:
-            text = f"ranks of {name} are {off:.2f} from uniform"
-            reasons.append(("refine", f"{text}, at least {off - margin:.2f}"))
+    for name, far in zip(names, distance, strict=True):
+        if far - margin > uneven:
+            text = f"ranks of {name} are {far:.2f} from uniform"
+            reasons.append(("refine", f"{text}, at least {far - margin:.2f}"))
     if _interval(gained, each)[1] < 0:
         text = f"it has {gained.mean():.2f} nats about the truth"
         reasons.append(("stop", f"{text}: the belief before the outcome knew more"))
-    if _interval(gap, each)[0] > tolerance.gap and _interval(excess, each)[0] > 0:
+    if _interval(gap, each)[0] > small and _interval(excess, each)[0] > 0:
         text = f"the log score is {mean:.2f} nats short of {information:.2f}"
         reasons.append(("refine", f"{text} that outcomes tell: it is blunt"))
     return Stratum(

@@ -13,7 +13,6 @@ from torch.distributions import Distribution
 from sbi_active.actions.discrete import Actions, action_space
 from sbi_active.diagnostics.calibration import (
     Calibration,
-    Tolerance,
     judge,
     worst,
 )
@@ -44,7 +43,6 @@ def check_calibration(
     num_posterior_samples: int = 200,
     max_strata: int = 24,
     gap: str = "auto",
-    tolerance: Tolerance | None = None,
     level: float = 0.05,
     seed: int = 0,
 ) -> Calibration:
@@ -71,7 +69,6 @@ def check_calibration(
         num_posterior_samples: Draws of the network a row.
         max_strata: Groups of actions at most; listed actions up to as many stand alone.
         gap: "likelihood" (declared noise), "classifier", or "auto".
-        tolerance: Tolerance of the verdict; None is ``Tolerance()``.
         level: Probability that a perfect network is flagged anywhere, at most.
         seed: Seed of all draws.
 
@@ -162,7 +159,6 @@ def check_calibration(
     names = getattr(simulator, "parameter_names", None) or names_of(belief, dim)
     options: Any = {
         "num_posterior_samples": num_posterior_samples,
-        "tolerance": Tolerance() if tolerance is None else tolerance,
         "names": names,
     }
     overall = judge("all", ranks, gaps, gained, level=level / 2, **options)

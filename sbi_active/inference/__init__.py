@@ -32,24 +32,4 @@ __all__ = [
     "refine",
 ]
 
-__getattr__ = former_names(
-    __name__,
-    {
-        "ActionLikelihood": "sbi_active.inference.models.factors:ActionLikelihood",
-        "ActionRatio": "sbi_active.inference.models.factors:ActionRatio",
-        "ChainedBelief": "sbi_active.inference.beliefs.belief:ChainedBelief",
-        "KernelBelief": "sbi_active.inference.beliefs.weighted:KernelBelief",
-        "MixtureDensityNetwork": (
-            "sbi_active.inference.networks.mixture_network:MixtureDensityNetwork"
-        ),
-        "Observation": "sbi_active.inference.rounds.rows:Observation",
-        "RatioClassifier": (
-            "sbi_active.inference.networks.ratio_network:RatioClassifier"
-        ),
-        "RefinedBelief": "sbi_active.inference.engine.learned:LearnedBelief",
-        "Refinement": "sbi_active:RefinementOptions",
-        "SeqBED_B": "sbi_active:SeqBED",
-        "SeqBED_C": "sbi_active:SeqBED",
-        "information_gained": "sbi_active.inference.beliefs.belief:information_gained",
-    },
-)
+__getattr__ = former_names(__name__)

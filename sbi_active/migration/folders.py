@@ -144,7 +144,7 @@ def _entries(path: Path) -> list[Mapping[str, Any]]:
     *lines, rest = (path.read_bytes() if path.exists() else b"").split(b"\n")
     if rest:
         text = f"SA610 {path} ends within line {len(lines) + 1}, which is left out:"
-        warn(f"{text} {rest!r:.200}", stacklevel=4)
+        warn(f"{text} {rest!r:.200}")
     entries = []
     for number, line in enumerate(lines, 1):
         head, _, tail = line.rpartition(b', "crc": "')

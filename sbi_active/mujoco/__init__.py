@@ -28,9 +28,4 @@ __all__ = [
     "randomization",
 ]
 
-__getattr__ = former_names(
-    __name__,
-    {
-        "Robot": "sbi_active.mujoco.robot:Robot",
-    },
-)
+__getattr__ = former_names(__name__)

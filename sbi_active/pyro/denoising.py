@@ -1,37 +1,71 @@
-r"""NUTS over the errors of an outcome, and what the simulator would have given.
+r"""An error model of an outcome, and what the simulator would have given.
 
-A channel may be right or wrong, two peaks of :math:`\log \sigma_c` between which no
-chain goes, and which of them it is the other channels tell. Its coordinate is therefore
-:math:`y_c = \Phi^{-1}(F_c(\sigma_c))` with :math:`F_c` about the marginal of its
-posterior, on a grid. That is the mean, over Gibbs sweeps, of
+All numbers are in deviations of the predictive, channel by channel. Every error is
+normal given its own deviation :math:`\sigma_c`, of which a channel that is right has a
+small one. Gibbs sweeps draw the deviations from
 
 .. math::
     p(\sigma_c | \sigma_{-c}, x_o) \propto p(\sigma_c) \sum_k
         w_k(\sigma_{-c})\, N(x_{o,c};\, m_{kc},\, v_{kc} + \sigma_c^2)
 
-in which x and the components are summed out (Rao-Blackwell), with a share of what the
-channel alone says to a power of .3, for the tails.
+on a grid, in which x, a normal mixture, its components and whether a channel is right
+are summed out; x is drawn given the deviations.
+
+References:
+    Ward, Cannon, Beaumont, Fasiolo & Schmon, "Robust neural posterior estimation and
+    statistical model criticism", NeurIPS 2022.
 """
 
 from __future__ import annotations
 
-import warnings
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
-import pyro
 import pyro.distributions as dist
 import torch
-from pyro.infer import MCMC, NUTS
 from pyro.ops.stats import effective_sample_size, split_gelman_rubin
 from torch import Tensor
 
-from sbi_active.arrays import Array
 from sbi_active.inference.sampling.mixtures import fitted_normals
 from sbi_active.inference.sampling.weights import log_sum_exp
-from sbi_active.pyro.error_models import ErrorModel
 from sbi_active.seeding import forked_generators
+
+
+@dataclass(frozen=True)
+class SpikeAndSlab:
+    r"""Each channel is right, or off by anything.
+
+    .. math::
+        x_o - x \sim (1 - \rho)\, N(0, s^2) + \rho\, t_3(0, S^2)
+
+    Attributes:
+        probability: Probability of misspecification of a channel, :math:`\rho`.
+        spike: s; small beside the noise, which the predictive has already.
+        slab: S.
+    """
+
+    probability: float = 0.1
+    spike: float = 0.005
+    slab: float = 10.0
+
+    def misspecified(self, x: Tensor, x_o: Tensor) -> Tensor:
+        """Return probabilities given denoised outcomes (n, q), shape (n, q)."""
+        right = dist.Normal(x, self.spike).log_prob(x_o) + np.log(1 - self.probability)
+        wrong = dist.StudentT(3.0, x, self.slab).log_prob(x_o)
+        return torch.sigmoid(wrong + np.log(self.probability) - right)
+
+    def log_deviation(self, log_sd: Tensor, *, rounded: float = 0.1) -> Tensor:
+        """Return the log density of the log deviation of a channel's error, (n,).
+
+        That of the spike is rounded; that of the slab is log(S) + log(v) / 2, v inverse
+        gamma.
+        """
+        right = dist.Normal(float(np.log(self.spike)), rounded).log_prob(log_sd)
+        v = torch.exp(2 * (log_sd - float(np.log(self.slab))))
+        wrong = dist.InverseGamma(1.5, 1.5).log_prob(v) + v.log() + np.log(2.0)
+        return torch.logaddexp(
+            right + np.log(1 - self.probability), wrong + np.log(self.probability)
+        )
 
 
 @dataclass(frozen=True)
@@ -71,13 +105,6 @@ class Predictive:
         volume = root.diagonal(dim1=-2, dim2=-1).log().sum(-1)
         return self.log_weight - 0.5 * off.square().sum(-1) - volume
 
-    def log_alone(self, x_o: Tensor, sd: Tensor) -> Tensor:
-        """Return log densities of each channel alone, (..., q) to (..., q)."""
-        variance = self.cov.diagonal(dim1=-2, dim2=-1) + sd[..., None, :] ** 2
-        square = (x_o - self.mean) ** 2 / variance
-        log_p = self.log_weight[:, None] - 0.5 * (square + variance.log())
-        return log_p.logsumexp(-2)
-
     def given(self, x_o: Tensor, sd: Tensor, seen: Tensor) -> Tensor:
         """Return a draw of x for each row of deviations, (n, seen) to (n, q)."""
         n, own = len(sd), self.marginal(seen)
@@ -92,109 +119,40 @@ class Predictive:
         return u + (self.cov[k][:, :, seen] @ back)[..., 0]
 
 
-class Coordinates:
-    """Log deviations as functions of coordinates that are about standard normal.
+def swept(
+    fit: Predictive,
+    target: Tensor,
+    error_model: SpikeAndSlab,
+    rng: np.random.Generator,
+    num_draws: int,
+    *,
+    num_burnt: int = 20,
+    lowest: float = 1e-4,
+    num_grid: int = 1_000,
+    smallest: float = 1e-12,
+) -> Tensor:
+    """Return draws of the channels' deviations by Gibbs sweeps, (num_draws, q).
 
     Args:
         fit: Predictive of the channels that were seen.
         target: Outcome of these channels, shape (q,).
         error_model: Error model of the deviations.
-        rng: Random generator of the Gibbs sweeps.
-        tempered: Power of what a channel says alone.
-        share: Share of that.
-        lowest: Smallest deviation.
-        num_grid: Number of deviations of the grid.
-        reach: Largest coordinate.
-        num_knots: Number of coordinates between which deviations are interpolated.
+        rng: Source of the draws.
+        num_draws: Number of sweeps that are kept.
+        num_burnt: Number of sweeps before.
+        lowest: Smallest deviation of the grid.
+        num_grid: Number of deviations of the grid, which are 1.5 % apart.
+        smallest: Variance of a channel given the others at least.
     """
-
-    def __init__(
-        self,
-        fit: Predictive,
-        target: Tensor,
-        error_model: ErrorModel,
-        rng: np.random.Generator,
-        *,
-        tempered: float = 0.3,
-        share: float = 0.1,
-        lowest: float = 1e-4,
-        num_grid: int = 1_000,
-        reach: float = 6.0,
-        num_knots: int = 1_201,
-    ) -> None:
-        self._reach, self._fit, self._target = reach, fit, target
-        highest = float(np.log(10 * float(target.abs().max()) + 100))
-        self._low = float(np.log(lowest))
-        self._step = (highest - self._low) / (num_grid - 1)
-        grid = self._low + self._step * torch.arange(num_grid, dtype=target.dtype)
-        log_prior = error_model.log_deviation(grid).numpy()
-        log_alone = fit.log_alone(target, grid.exp()[:, None].expand(-1, len(target)))
-        alone = tempered * log_alone.numpy().T
-        alone = _normalized(alone, log_prior) + np.log(share)
-        gibbs = _swept(fit, target, log_prior, grid.numpy(), rng) + np.log(1 - share)
-        gain = np.logaddexp(alone, gibbs)  # density over the prior's, (q, grid)
-        log_p = gain + log_prior
-        p = np.exp(log_p - log_p.max(1, keepdims=True))
-        area = 0.5 * (p[:, 1:] + p[:, :-1])
-        cdf = np.concatenate([np.zeros((len(p), 1)), area.cumsum(1)], 1)
-        cdf = cdf / cdf[:, -1:]
-        y = torch.linspace(-reach, reach, num_knots, dtype=target.dtype)
-        levels = torch.special.ndtr(y).numpy()
-        # Where nothing is likely the distribution is flat, and has no inverse.
-        rising = np.arange(num_grid) * 1e-15
-        points = grid.numpy()
-        knots = [np.interp(levels, row + rising, points) for row in cdf]
-        self._knots = torch.from_numpy(np.stack(knots, 1))
-        self._gain = torch.from_numpy(np.ascontiguousarray(gain.T))
-
-    def __call__(self, y: Tensor) -> Tensor:
-        """Return log deviations, (..., q) to (..., q)."""
-        place = (y + self._reach) * ((len(self._knots) - 1) / (2 * self._reach))
-        return _between(self._knots, place)
-
-    def log_gain(self, log_sd: Tensor) -> Tensor:
-        """Return the log density behind y over the prior's, (..., q) to (..., q)."""
-        return _between(self._gain, (log_sd - self._low) / self._step)
-
-    def potential(self, sites: dict[str, Tensor]) -> Tensor:
-        """Return minus the log density of coordinates, the site "y"."""
-        y, log_sd = sites["y"], self(sites["y"])
-        joint = self._fit.log_joint(self._target, log_sd.exp()).logsumexp(-1)
-        return 0.5 * y.square().sum(-1) - joint + self.log_gain(log_sd).sum(-1)
-
-
-def _between(table: Tensor, place: Tensor) -> Tensor:
-    """Return a table's columns (n, q) at places between its rows, (..., q)."""
-    place = place.clamp(0, len(table) - 1)
-    low = place.detach().long().clamp_max(len(table) - 2)
-    column = torch.arange(place.shape[-1])
-    return torch.lerp(table[low, column], table[low + 1, column], place - low)
-
-
-def _normalized(log_gain: Array, log_prior: Array) -> Array:
-    """Return log densities over the prior's, each row of which has mass one."""
-    total = [log_sum_exp(row + log_prior) for row in log_gain]
-    return log_gain - np.array(total)[:, None]
-
-
-def _swept(
-    fit: Predictive,
-    target: Tensor,
-    log_prior: Array,
-    grid: Array,
-    rng: np.random.Generator,
-    *,
-    num_burnt: int = 20,
-    num_sweeps: int = 80,
-    smallest: float = 1e-12,
-) -> Array:
-    """Return each channel's log marginal over its prior by Gibbs sweeps, (q, grid)."""
-    x, mean, cov = target.numpy(), fit.mean.numpy(), fit.cov.numpy()
+    highest = np.log(10 * float(target.abs().max()) + 100)
+    grid = np.linspace(np.log(lowest), highest, num_grid)
+    log_prior = error_model.log_deviation(torch.from_numpy(grid)).numpy()
+    mean, cov = fit.mean.numpy(), fit.cov.numpy()
     log_weight, variances = fit.log_weight.numpy(), np.exp(2 * grid)
-    num, residual = len(x), x - mean  # (k, q)
-    variance = np.exp(2 * grid[rng.integers(len(grid), size=num)])
-    total = np.full((num, len(grid)), -np.inf)
-    for sweep in range(num_burnt + num_sweeps):
+    num, residual = len(target), target.numpy() - mean  # (k, q)
+    variance = variances[rng.integers(num_grid, size=num)]
+    kept = []
+    for _ in range(num_burnt + num_draws):
         noisy = cov + np.diag(variance)
         precision = np.linalg.inv(noisy)
         log_volume = np.linalg.slogdet(noisy)[1]
@@ -207,13 +165,9 @@ def _swept(
             rest = log_weight - 0.5 * (square + log_volume - np.log(spread))
             v = np.maximum(spread - variance[c], smallest)[:, None] + variances
             log_k = rest[:, None] - 0.5 * (off[:, None] ** 2 / v + np.log(v))
-            gain = np.logaddexp.reduce(log_k, 0)
-            log_p = gain + log_prior
-            log_total = log_sum_exp(log_p)
-            if sweep >= num_burnt:
-                total[c] = np.logaddexp(total[c], gain - log_total)
-            p = np.exp(log_p - log_total)
-            drawn = variances[rng.choice(len(grid), p=p / p.sum())]
+            log_p = np.logaddexp.reduce(log_k, 0) + log_prior
+            p = np.exp(log_p - log_sum_exp(log_p))
+            drawn = variances[rng.choice(num_grid, p=p / p.sum())]
             change = drawn - variance[c]
             grown = 1 + change * own
             column = precision[:, :, c]
@@ -222,7 +176,8 @@ def _swept(
             )
             log_volume = log_volume + np.log(grown)
             variance[c] = drawn
-    return total - np.log(num_sweeps)
+        kept.append(np.sqrt(variance))
+    return torch.from_numpy(np.stack(kept[num_burnt:]))
 
 
 @dataclass(frozen=True)
@@ -234,23 +189,21 @@ class Denoised:
             observed are as the others leave them.
         probability: Probability of misspecification, a channel, shape (q,); NaN where
             it was not observed.
-        r_hat: Largest over channels (split, two chains), of x and of the coordinates
-            that NUTS runs over; 1 where nothing was observed.
+        r_hat: Largest over channels (split, two chains), of x and of the logarithms of
+            their deviations; 1 where nothing was observed.
         effective_sample_size: Smallest over the same.
-        num_divergences: Divergences of both chains.
     """
 
     x: Tensor = field(repr=False)
     probability: Tensor
     r_hat: float
     effective_sample_size: float
-    num_divergences: int
 
 
 def denoise(
     x_o: Tensor,
     predictive: Tensor,
-    error_model: ErrorModel,
+    error_model: SpikeAndSlab,
     *,
     seed: int,
     fewest: int = 20,
@@ -259,16 +212,8 @@ def denoise(
 ) -> Denoised:
     r"""Return draws of :math:`p(x | x_o) \propto p(x_o | x)\, p(x)`.
 
-    p(x) is a normal mixture fitted to simulations, so that x is what they can give, and
-    errors are normal given their deviations :math:`\sigma`. Indicators and x are summed
-    out of
-
-    .. math::
-        p(\sigma | x_o) \propto L(\sigma) \prod_c p(\sigma_c), \qquad
-        L(\sigma) = \sum_k w_k\, N(x_o; \mu_k, \Sigma_k + \mathrm{diag}(\sigma^2)),
-
-    over which NUTS runs, in coordinates in which each channel's posterior is about
-    standard normal (:class:`Coordinates`), and x is drawn given each :math:`\sigma`.
+    p(x) is a normal mixture fitted to simulations, so that x is what they can give;
+    deviations are drawn by :func:`swept`, in two chains.
 
     Args:
         x_o: Outcome, shape (q,); NaN where a channel was not observed.
@@ -298,60 +243,17 @@ def denoise(
     fit = Predictive.fit((predictive - center) / scale, seed)
     target = ((x_o - center) / scale)[seen]
     probability = torch.full_like(x_o, torch.nan)
-    r_hat, ess, divergences = 1.0, 2.0 * num_draws, 0
-    with (
-        forked_generators(seed, "denoise"),
-        pyro.validation_enabled(False),
-        warnings.catch_warnings(),
-    ):
-        warnings.simplefilter("ignore")
-        if not bool(seen.any()):
-            x = fit.given(target, torch.zeros(2 * num_draws, 0).double(), seen)
-        else:
-            own, rng = fit.marginal(seen), np.random.default_rng(seed)
-            coordinates = Coordinates(own, target, error_model, rng)
-            y, divergences = _nuts(coordinates, torch.full_like(target, 0.7), num_draws)
-            x = fit.given(target, coordinates(y).exp(), seen)
-            probability[seen] = error_model.misspecified(x[:, seen], target).mean(0)
-            chains = torch.cat([x[:, seen], y], 1).reshape(2, num_draws, -1)
-            r_hat = float(split_gelman_rubin(chains, chain_dim=0, sample_dim=1).max())
-            ess = effective_sample_size(chains, chain_dim=0, sample_dim=1)
-            ess = float(ess.min())
-    return Denoised(x * scale + center, probability, r_hat, ess, divergences)
-
-
-def _nuts(
-    coordinates: Coordinates,
-    start: Tensor,
-    num_draws: int,
-    *,
-    depth: int = 5,
-    accepted: float = 0.65,
-    num_warmup: int = 40,
-) -> tuple[Tensor, int]:
-    """Return coordinates (n, q) of two chains, from a start and its mirror image.
-
-    And the number of their divergences.
-    """
-    draws, divergences = [], 0
-    for y in (-start, start):
-        # Coordinates are about standard normal: no masses are to be learned.
-        kernel = NUTS(
-            potential_fn=coordinates.potential,
-            step_size=1.0,  # pyright: ignore
-            adapt_mass_matrix=False,
-            target_accept_prob=accepted,
-            max_tree_depth=depth,
-        )
-        run = MCMC(
-            kernel,
-            num_draws,
-            warmup_steps=num_warmup,
-            initial_params={"y": y},
-            disable_progbar=True,
-        )
-        run.run()
-        notes: dict[str, Any] = run.diagnostics()
-        divergences += sum(len(rows) for rows in notes.get("divergences", {}).values())
-        draws.append(run.get_samples()["y"])
-    return torch.cat(draws), divergences
+    r_hat, ess = 1.0, 2.0 * num_draws
+    own, rng = fit.marginal(seen), np.random.default_rng(seed)
+    sd = torch.zeros(2 * num_draws, 0).double()
+    with forked_generators(seed, "denoise"):
+        if bool(seen.any()):
+            given = own, target, error_model, rng, num_draws
+            sd = torch.cat([swept(*given), swept(*given)])
+        x = fit.given(target, sd, seen)
+    if bool(seen.any()):
+        probability[seen] = error_model.misspecified(x[:, seen], target).mean(0)
+        chains = torch.cat([x[:, seen], sd.log()], 1).reshape(2, num_draws, -1)
+        r_hat = float(split_gelman_rubin(chains, chain_dim=0, sample_dim=1).max())
+        ess = effective_sample_size(chains, chain_dim=0, sample_dim=1).min()
+    return Denoised(x * scale + center, probability, r_hat, float(ess))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from copy import deepcopy
 from typing import Any
 
@@ -11,13 +11,14 @@ import torch
 from torch import Tensor
 from torch.distributions import Distribution
 
-from sbi_active.inference.beliefs.belief import Belief, ChainedBelief, named
+from sbi_active.inference.beliefs.belief import Belief, ChainedBelief
 from sbi_active.inference.beliefs.priors import require_support
+from sbi_active.inference.declared.settings import RefinementOptions
 from sbi_active.inference.networks.mixture_network import MixtureDensityNetwork
 from sbi_active.inference.rounds.condition import pack
+from sbi_active.inference.rounds.rows import Observation
 from sbi_active.inference.trainers.asbi import ASBI
-from sbi_active.pyro.denoising import Denoised, denoise
-from sbi_active.pyro.error_models import SpikeAndSlab
+from sbi_active.pyro.denoising import Denoised, SpikeAndSlab, denoise
 from sbi_active.seeding import derive_seed, forked_generators
 from sbi_active.simulation import simulate
 
@@ -52,9 +53,8 @@ class RobustBelief(ChainedBelief):
         self.denoised = denoised
         self.diagnostics = self.diagnostics.extended(
             misspecification=denoised.probability.tolist(),
-            nuts_r_hat=denoised.r_hat,
-            nuts_effective_draws=denoised.effective_sample_size,
-            nuts_divergences=denoised.num_divergences,
+            gibbs_r_hat=denoised.r_hat,
+            gibbs_effective_draws=denoised.effective_sample_size,
         )
 
     def _raw(self, num: int) -> Tensor:
@@ -78,8 +78,9 @@ class RobustASBI(ASBI):
 
     A trial's outcome is denoised with the error model and the predictive under the
     belief before it, and the belief becomes the network's posterior averaged over
-    denoised outcomes. The simulator is only used for the predictive, and nothing is
-    refined: the result is a chained approximation as that of :class:`ASBI` without one.
+    denoised outcomes. The simulator, which :meth:`update` needs, is only used for the
+    predictive, and nothing is refined: the result is a chained approximation as that of
+    :class:`ASBI` without one.
 
     Args:
         prior: Prior of the parameters; it and all that follows are those of
@@ -106,41 +107,29 @@ class RobustASBI(ASBI):
         self.num_predictive, self.num_averaged = num_predictive, num_averaged
         self.denoised: list[Denoised] = []
 
-    def update(
+    def _inferred(
         self,
-        x_o: Tensor,
+        trials: Sequence[Observation],
+        simulator: Callable[..., Any] | None,
+        settings: RefinementOptions,
+        seed: int | None,
         *,
-        action: Tensor,
-        simulator: Callable[..., Any] | None = None,
-        refinement: Any = None,
-        seed: int | None = None,
+        afresh: bool,
     ) -> Belief:
-        """Return the belief after a real trial, and make it the current one.
+        """Return the belief after a further trial, see :meth:`.ActiveInference.update`.
 
-        Args:
-            x_o: The outcome. NaN is information where simulations of this round lacked
-                those numbers too; else their sensor failed, and they are drawn from
-                what the predictive says given the others.
-            action: The executed action.
-            simulator: Simulator of the predictive; required.
-            refinement: Refinement, which must be None.
-            seed: Seed of all draws; None draws one from torch's global generator.
-
-        Raises:
-            ValueError: If there is no simulator, a refinement is asked for, or fewer
-                than 20 of 1,000 simulations have the numbers that the outcome has.
-            RuntimeError: If nothing was trained in this round.
+        NaN in an outcome is information where simulations of this round lacked those
+        numbers too; else their sensor failed, and they are drawn from what the
+        predictive says given the others.
         """
-        if simulator is None or refinement is not None:
+        if simulator is None or afresh:
             raise ValueError(
                 "expected a simulator, whose predictive tells what an outcome may be, "
-                f"and no refinement; got simulator={simulator}, refinement="
-                f"{refinement}; pass the simulator alone"
+                f"and trials one by one; got simulator={simulator} and {len(trials)} "
+                "trials; pass the simulator to update()"
             )
-        trial = self._observation(x_o, action)
         self._require_trained()
-        network, previous = self._neural_net, self.belief
-        assert network is not None
+        network, previous, trial = self._neural_net, self.belief, trials[-1]
         assert previous is not None
         seed = int(torch.randint(2**62, ())) if seed is None else seed
         with forked_generators(seed, "predictive"):
@@ -148,23 +137,19 @@ class RobustASBI(ASBI):
         actions = trial.action.expand(self.num_predictive, -1)
         rows = simulate(simulator, theta, actions, seed=derive_seed(seed, "rows"))
         flat, x_o = rows.x.reshape(len(rows.x), -1), trial.x.reshape(-1)
-        missing = x_o.isnan()
-        known = False
-        if bool(missing.any()) and isinstance(network, MixtureDensityNetwork):
-            known = network.knows(pack(trial.x[None], trial.action[None]))
         # A number that simulations lack too is information; else its sensor failed.
-        lacking = missing if known else torch.zeros_like(missing)
+        lacking = missing = x_o.isnan()
+        condition = pack(trial.x[None], trial.action[None])
+        is_ours = isinstance(network, MixtureDensityNetwork)
+        if not (is_ours and network.knows(condition)):
+            lacking = torch.zeros_like(missing)
         rows_alike = (flat.isnan() == lacking).all(1) & ~flat.isinf().any(1)
         flat = torch.where(lacking, 0.0, flat[rows_alike])
-        denoised = denoise(x_o, flat, self.error_model, seed=derive_seed(seed, "nuts"))
+        denoised = denoise(x_o, flat, self.error_model, seed=derive_seed(seed, "gibbs"))
         pick = torch.linspace(0, len(denoised.x) - 1, self.num_averaged).long()
         x = torch.where(lacking, torch.nan, denoised.x[pick].float())
         x = x.reshape(len(pick), *trial.x.shape)
         condition = pack(x, trial.action.expand(len(pick), -1)).to(self._device)
         prior = require_support(self._prior)
-        belief = RobustBelief(deepcopy(network), condition, prior, previous, denoised)
-        named(belief, simulator)
-        self._belief, self.trials = belief, [*self.trials, trial]
         self.denoised.append(denoised)
-        self._forget_round()
-        return belief
+        return RobustBelief(deepcopy(network), condition, prior, previous, denoised)

@@ -49,14 +49,4 @@ __all__ = [
     "simulate",
 ]
 
-__getattr__ = lazy_names(
-    __name__,
-    {
-        "ReusedRows": "sbi_active.simulation.reweighting:ReusedRows",
-        "RowStore": "sbi_active.simulation.workers.store:RowStore",
-        "Simulator": "sbi_active.simulation.simulator:Simulator",
-        "SimulatorReport": "sbi_active.simulation.check:SimulatorReport",
-        "require_noise": "sbi_active.simulation.simulator:require_noise",
-        "unknown_noise": "sbi_active:AutocorrelatedNoise.unknown",
-    },
-)
+__getattr__ = lazy_names(__name__)

@@ -115,7 +115,7 @@ def reuse(
     if worth < FEW:
         text = f"SA304 {len(rows)} rows of the bank are worth {worth:.1f} draws"
         advice = "simulate more rows from it or near it, or give all proposals="
-        warn(f"{text} from the target, fewer than {FEW}: {advice}", stacklevel=2)
+        warn(f"{text} from the target, fewer than {FEW}: {advice}")
     return result
 
 

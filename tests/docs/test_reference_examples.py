@@ -26,7 +26,7 @@ reference = importlib.util.module_from_spec(spec)
 spec.loader.exec_module(reference)
 
 
-DEAR = {"pyro": pytest.mark.slow}  # NUTS
+DEAR = {"pyro": pytest.mark.slow}  # trains a network
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""Pyro models as simulators, error models, and NUTS over denoised outcomes."""
+"""Pyro models as simulators, the error model, and draws of denoised outcomes."""
 
 import math
 
@@ -12,14 +12,8 @@ from torch.distributions import Normal, StudentT
 
 from sbi_active import MixtureDensity
 from sbi_active.inference import refine
-from sbi_active.pyro import (
-    ChannelBias,
-    RobustASBI,
-    SpikeAndSlab,
-    StudentError,
-    from_pyro,
-)
-from sbi_active.pyro.denoising import Coordinates, Predictive, _normalized, denoise
+from sbi_active.pyro import RobustASBI, SpikeAndSlab, from_pyro
+from sbi_active.pyro.denoising import Predictive, denoise, swept
 from sbi_active.seeding import forked_generators
 from sbi_active.simulation import GaussianNoise, StudentTNoise
 
@@ -141,12 +135,10 @@ def test_a_first_trial_of_any_kind_leaves_a_belief(x):
         assert bool((probability > 0.99).all())
 
 
-# Error models and NUTS over denoised outcomes
+# The error model, and denoised outcomes
 
 
-pytest.importorskip("pyro")
-
-MODELS = [SpikeAndSlab(), ChannelBias(), StudentError()]
+SPIKES = SpikeAndSlab()
 
 
 def predictive(*shape, correlation=0.0):
@@ -159,20 +151,19 @@ def predictive(*shape, correlation=0.0):
 @pytest.mark.slow
 def test_a_gross_channel_is_told_and_goes_back_to_the_predictive():
     x_o = torch.tensor([3.0, 500.0])
-    found = denoise(x_o, 2.0 + 3.0 * predictive(1_000, 2), SpikeAndSlab(), seed=0)
+    found = denoise(x_o, 2.0 + 3.0 * predictive(1_000, 2), SPIKES, seed=0)
     assert found.probability[0] < 0.1
     assert found.probability[1] > 0.99
     assert float(found.x[:, 0].median()) == pytest.approx(3.0, abs=0.1)
     assert float(found.x[:, 1].mean()) == pytest.approx(2.0, abs=0.8)
     assert float(found.x[:, 1].std()) == pytest.approx(3.0, rel=0.25)
     assert found.r_hat < 1.1
-    assert "divergences" in str(found)
 
 
 @pytest.mark.slow
 def test_a_channel_that_was_not_observed_follows_the_others():
     draws = predictive(1_000, 2, correlation=0.99)
-    found = denoise(torch.tensor([1.5, torch.nan]), draws, SpikeAndSlab(), seed=0)
+    found = denoise(torch.tensor([1.5, torch.nan]), draws, SPIKES, seed=0)
     kept = found.x[(found.x[:, 0] - 1.5).abs() < 0.1]
     assert len(kept) > 200
     assert float(kept[:, 1].mean()) == pytest.approx(1.5, abs=0.1)
@@ -182,42 +173,32 @@ def test_a_channel_that_was_not_observed_follows_the_others():
 
 def test_nothing_observed_leaves_the_predictive():
     draws = 5.0 + predictive(1_000, 2)
-    found = denoise(torch.full((2,), torch.nan), draws, SpikeAndSlab(), seed=0)
+    found = denoise(torch.full((2,), torch.nan), draws, SPIKES, seed=0)
     assert float(found.x.mean()) == pytest.approx(5.0, abs=0.2)
-    assert found.num_divergences == 0
 
 
-@pytest.mark.parametrize("model", MODELS)
-def test_errors_count_by_their_size(model):
+def test_errors_count_by_their_size():
     x = torch.zeros(1, 2)
-    probability = model.misspecified(x, torch.tensor([0.0, 50.0]))
+    probability = SPIKES.misspecified(x, torch.tensor([0.0, 50.0]))
     assert probability[0, 0] < 0.05
     assert probability[0, 1] > 0.95
 
 
-@pytest.mark.parametrize("model", MODELS)
-def test_deviations_give_the_errors_of_the_program(model):
+def test_deviations_give_the_errors_of_the_program():
     """The normal errors of all deviations, summed, are the density of an outcome."""
     log_sd = torch.linspace(-12.0, 12.0, 20_001).double()
     step = log_sd[1] - log_sd[0]
-    weight = model.log_deviation(log_sd).exp() * step
+    weight = SPIKES.log_deviation(log_sd).exp() * step
     assert float(weight.sum()) == pytest.approx(1.0, abs=1e-3)
     errors = torch.tensor([0.0, 0.004, 1.0, 30.0]).double()
     summed = (Normal(0.0, log_sd.exp()).log_prob(errors[:, None]).exp() * weight).sum(1)
-    if isinstance(model, StudentError):
-        exact = StudentT(model.df, 0.0, model.scale).log_prob(errors).exp()
-    else:
-        parts = model._parts(torch.zeros(4, 1), errors[:, None])
-        exact = parts.logsumexp(0)[:, 0].exp()
+    exact = 0.9 * Normal(0.0, SPIKES.spike).log_prob(errors).exp()
+    exact = exact + 0.1 * StudentT(3.0, 0.0, SPIKES.slab).log_prob(errors).exp()
     # A known deviation is rounded by a tenth, which tells in the tails of a normal.
     assert summed[:3].tolist() == pytest.approx(exact[:3].tolist(), rel=0.03)
     assert summed[3] >= 0.97 * exact[3]
 
 
-# Coordinates of the errors' deviations, beside sums over a grid
-
-
-SPIKES = SpikeAndSlab()
 COV = torch.tensor([[1.0, 0.95], [0.95, 1.0]], dtype=torch.float64)
 TWO = Predictive(
     torch.tensor([0.5, 0.5], dtype=torch.float64).log(),
@@ -226,34 +207,18 @@ TWO = Predictive(
 )
 
 
-def coordinates(target, seed=0):
-    fit = TWO.marginal(torch.arange(2) < len(target))
-    rng = np.random.default_rng(seed)
-    return fit, Coordinates(fit, target, SPIKES, rng)
-
-
-def mass(values):
-    return values / values.sum()
-
-
 @pytest.mark.parametrize("x", [[0.3], [6.0], [0.4, 2.9], [0.4, 0.3]])
-def test_a_channel_has_its_marginal_with_a_share_of_what_it_says_alone(x):
+def test_sweeps_draw_the_deviations_of_each_channel(x):
+    """Beside sums over a grid: right or wrong, and how far."""
     target = torch.tensor(x, dtype=torch.float64)
-    fit, found = coordinates(target)
-    grid = torch.linspace(-9.2, 4.0, 400, dtype=torch.float64)
-    prior = SPIKES.log_deviation(grid)
+    fit = TWO.marginal(torch.arange(2) < len(target))
+    drawn = swept(fit, target, SPIKES, np.random.default_rng(0), 2_000).log()
+    grid = torch.linspace(-9.2, 4.8, 400, dtype=torch.float64)
     pairs = torch.cartesian_prod(*[grid] * len(target)).reshape(-1, len(target))
     log_p = fit.log_joint(target, pairs.exp()).logsumexp(-1)
     log_p = log_p + SPIKES.log_deviation(pairs).sum(-1)
-    shape = [len(grid)] * len(target)
-    joint = mass((log_p - log_p.max()).exp()).reshape(shape)
-    log_alone = fit.log_alone(target, grid.exp()[:, None].expand(-1, len(target)))
-    alone = _normalized((0.3 * log_alone).numpy().T, prior.numpy())
-    log_sd = grid[:, None].expand(-1, len(target))
-    got = found.log_gain(log_sd) + prior[:, None]
-    for c in range(len(target)):
-        others = [k for k in range(len(target)) if k != c]
-        exact = joint.sum(others) if others else joint
-        tails = mass(torch.from_numpy(np.exp(alone[c])) * prior.exp())
-        wanted = 0.9 * exact + 0.1 * tails
-        assert float((mass(got[:, c].exp()) - wanted).abs().sum()) < 0.1
+    p = log_p.softmax(0)
+    for edge in (-3.0, 1.0, 2.5):
+        exact = (p[:, None] * (pairs < edge)).sum(0)
+        found = (drawn < edge).double().mean(0)
+        assert torch.allclose(found, exact, atol=0.06), edge

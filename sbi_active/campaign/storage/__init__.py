@@ -6,6 +6,4 @@ infer or design.
 
 from sbi_active.renamed import former_names
 
-FORMER = {"DamagedCampaignError": "sbi_active.simulation.bank:CorruptSegmentError"}
-
-__getattr__ = former_names(__name__, FORMER)
+__getattr__ = former_names(__name__)

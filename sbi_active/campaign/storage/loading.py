@@ -67,7 +67,7 @@ def load(
     if kept["options"] not in (None, found["options"]):
         text = f"the campaign in {storage.path} keeps {manifest['options_text']}"
         text = f"SA604 options= hold for this process: {text}; pass them at each load"
-        warn(text, stacklevel=4)
+        warn(text)
     storage.prior = prior = found["prior"]
 
     def saved(model: Any) -> Any:
@@ -151,5 +151,5 @@ def _again(what: str, read: Callable[[], Any]) -> Any:
     try:
         return read()
     except (OSError, ValueError) as error:
-        warn(f"SA601 the {what} has to be computed again: {error}", stacklevel=5)
+        warn(f"SA601 the {what} has to be computed again: {error}")
         return None

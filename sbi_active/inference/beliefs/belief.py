@@ -192,8 +192,7 @@ class ChainedBelief(Belief):
                 f"SA106 only {acceptance:.2%} of the network's posterior lies within "
                 "the prior's support: the observation is unlike those simulated, or "
                 "the truth lies outside the prior. The belief is resampled from the "
-                "one before and is coarse.",
-                stacklevel=4,
+                "one before and is coarse."
             )
 
     def _resample(self, previous: Distribution) -> None:

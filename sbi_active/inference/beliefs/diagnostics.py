@@ -108,39 +108,30 @@ class Diagnostics:
             if value is not None and not (isinstance(value, containers) and not value)
         }
 
+    def _pairs(self) -> list[tuple[str, Any]]:
+        """Return what is known by what it is; None or "" where it is not."""
+        broken = [name for name, a in self.assumptions.items() if not a.holds]
+        return [
+            ("assumptions that do not hold", ", ".join(broken)),
+            ("parameters", str(self.combinations) if self.combinations else None),
+            ("simulations", self.num_simulations or None),
+            ("lost of them", self.num_missing or None),
+            ("effective draws", number(self.effective_sample_size)),
+            ("off by [nats]", number(self.error_nats)),
+            ("tail probability of the trials", number(self.tail_probability)),
+        ]
+
     def __str__(self) -> str:
         texts = (*self.warnings, *self.network_warnings)
         lines = [VERDICTS[self.trustworthy][1], *(f"- {text}" for text in texts)]
-        broken = [name for name, a in self.assumptions.items() if not a.holds]
-        if broken:
-            lines.append(f"assumptions that do not hold: {', '.join(broken)}")
-        if self.combinations:
-            lines.append(str(self.combinations))
-        if self.num_simulations:
-            lines.append(f"{self.num_simulations} simulations")
-        if self.effective_sample_size is not None:
-            lines.append(f"{self.effective_sample_size:.0f} effective draws")
-        if self.error_nats is not None:
-            lines.append(f"off by about {self.error_nats:.2g} nats")
-        if self.tail_probability is not None:
-            lines.append(f"tail probability of the trials {self.tail_probability:.2g}")
-        return "\n".join(lines)
+        return "\n".join([*lines, *(f"{k}: {v}" for k, v in self._pairs() if v)])
 
     __repr__ = __str__
 
     def _repr_html_(self) -> str:
         kind, verdict = VERDICTS[self.trustworthy]
-        broken = [name for name, a in self.assumptions.items() if not a.holds]
         texts = (*self.warnings, *self.network_warnings)
-        effective, tail = self.effective_sample_size, self.tail_probability
-        pairs = [
-            ("assumptions that do not hold", ", ".join(broken) or None),
-            ("simulations", self.num_simulations or None),
-            ("lost of them", self.num_missing or None),
-            ("effective draws", None if effective is None else f"{effective:.0f}"),
-            ("off by [nats]", number(self.error_nats) or None),
-            ("tail probability of the trials", number(tail) or None),
-        ]
+        pairs = [(k, v or None) for k, v in self._pairs()]
         return card(badge(verdict, kind), items(texts), facts(pairs))
 
     def __getattr__(self, name: str) -> Any:
@@ -162,8 +153,5 @@ class Diagnostics:
         return self._as_dict(f".get({name!r})").get(name, default)
 
     def _as_dict(self, used: str) -> dict[str, Any]:
-        warn(
-            f"SA701 diagnostics{used} is deprecated; use an attribute, or to_dict()",
-            stacklevel=3,
-        )
+        warn(f"SA701 diagnostics{used} is deprecated; use an attribute, or to_dict()")
         return self.to_dict()

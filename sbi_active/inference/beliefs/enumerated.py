@@ -7,7 +7,6 @@ import math
 import uuid
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from itertools import product
 from typing import Any, ClassVar
 
 import numpy as np
@@ -55,33 +54,26 @@ class Enumeration:
             return None
         sizes = [int(size) for size in prior.dims_per_dist]
         columns = torch.arange(sum(sizes)).split(sizes)
-        values = [_values(part) for part in prior.dists]
-        known = [(v, n) for v, n in zip(values, sizes, strict=True) if v is not None]
-        if math.prod(len(v) ** n for v, n in known) > Enumeration.most_values:
+        parts: list[Any] = [
+            *zip(prior.dists, columns, map(_values, prior.dists), strict=True)
+        ]
+        chosen = [part for part in parts if part[2] is not None]
+        rest = [part for part in parts if part[2] is None]
+        axes = [own for _, at, own in chosen for _ in at]
+        num = math.prod(len(own) for own in axes)
+        if not (chosen and rest and num <= Enumeration.most_values):
             return None
-        rest, others, chosen, places = [], [], [], []
-        for part, size, at, own in zip(
-            prior.dists, sizes, columns, values, strict=True
-        ):
-            if own is None:
-                rest.append(part)
-                others.append(at)
-            else:
-                rows = torch.tensor([*product(own.tolist(), repeat=size)])
-                log_p = part.log_prob(rows).reshape(len(rows), -1).sum(1)
-                chosen.append([*zip(rows, log_p, strict=True)])
-                places.append(at)
-        if not chosen or not rest:
-            return None
-        pairs = [*product(*chosen)]
-        combined = torch.stack([torch.cat([row for row, _ in own]) for own in pairs])
-        log_p = torch.stack([torch.stack([p for _, p in own]).sum() for own in pairs])
-        possible = log_p > -torch.inf
-        joint = rest[0]
+        values = torch.cartesian_prod(*axes).reshape(num, -1)
+        log_p = torch.zeros(num)
+        own = values.split([len(at) for _, at, _ in chosen], 1)
+        for (part, _, _), rows in zip(chosen, own, strict=True):
+            log_p = log_p + part.log_prob(rows).reshape(num, -1).sum(1)
+        joint, possible = rest[0][0], log_p > -torch.inf
         if len(rest) > 1:
-            joint = MultipleIndependent(rest, validate_args=False)
-        places, others = torch.cat(places), torch.cat(others)
-        return Enumeration(places, combined[possible], log_p[possible], others, joint)
+            others = [part for part, _, _ in rest]
+            joint = MultipleIndependent(others, validate_args=False)
+        places, others = (torch.cat([at for _, at, _ in g]) for g in (chosen, rest))
+        return Enumeration(places, values[possible], log_p[possible], others, joint)
 
     def filled(self, k: int, theta: Tensor) -> Tensor:
         """Return parameters (..., d) of continuous ones (..., d - m), combination k."""
@@ -223,57 +215,57 @@ def enumerated(
     Raises:
         UnexplainedOutcomeError: If no combination explains the outcomes.
     """
-    parts: list[Belief] = []
-    log_mass, kept, fault = [], [], None
+    found: dict[int, Any] = {}
+    fault = None
     for k in range(len(enumeration.values)):
         own = filled_simulator(simulator, enumeration, k)
+        seeded = derive_seed(seed, "values", k)
         try:
-            part = refine(own, enumeration.rest, seed=derive_seed(seed, "values", k))
+            found[k] = refine(own, enumeration.rest, seed=seeded)
         except UnexplainedOutcomeError as error:
             fault = error
-            continue
-        kept.append(k)
-        parts.append(part)
-        log_mass.append(float(enumeration.log_prob[k]) + part.log_evidence)
-    if fault is not None and not parts:
+    if fault is not None and not found:
         raise fault
-    mass = torch.tensor(log_mass, dtype=torch.float64)
-    known = [part.diagnostics.figures for part in parts]
-    is_inflated = torch.tensor(["noise_inflation" in figures for figures in known])
-    if not bool(is_inflated.all()):
+    kept, parts = [*found], [*found.values()]
+    values, log_prob = enumeration.values[kept], enumeration.log_prob[kept]
+    evidence = [part.log_evidence for part in parts]
+    mass = log_prob.double() + torch.tensor(evidence, dtype=torch.float64)
+    known = [part.diagnostics for part in parts]
+    inflated = torch.tensor(["noise_inflation" in d.figures for d in known])
+    if not bool(inflated.all()):
         # Trials contradict each other where the noise was inflated. Evidence under
         # wider noise is not comparable: trials rule these values out.
-        mass[is_inflated] = -torch.inf
-    values, log_prob = enumeration.values[kept], enumeration.log_prob[kept]
+        mass[inflated] = -torch.inf
     some = replace(enumeration, values=values, log_prob=log_prob)
     belief = EnumeratedBelief(prior, some, parts, mass.softmax(0))
-    belief.diagnostics = _diagnosed(belief, float(mass.logsumexp(0)))
+    belief.diagnostics = _diagnosed(belief, known, float(mass.logsumexp(0)))
     return belief
 
 
 def _diagnosed(
-    belief: EnumeratedBelief, log_evidence: float, *, negligible: float = 0.01
+    belief: EnumeratedBelief,
+    known: Sequence[Diagnostics],
+    log_evidence: float,
+    *,
+    negligible: float = 0.01,
 ) -> Diagnostics:
     """Return what is known of a mixture: the worst of the parts that count."""
-    known = [part.diagnostics for part in belief.parts]
-    counts = (belief.probability > negligible).nonzero()[:, 0].tolist()
-    some = [known[k] for k in counts]
-    effective = [d.effective_sample_size for d in some]
+    rows = [*zip(belief.values.tolist(), belief.probability.tolist(), strict=True)]
+    count = [(v, d) for (v, p), d in zip(rows, known, strict=True) if p > negligible]
+    effective = [d.effective_sample_size or 0.0 for _, d in count]
     texts = [
-        f"where the discrete parameters are {belief.values[k].tolist()}: {text}"
-        for k in counts
-        for text in known[k].warnings
+        f"where the discrete parameters are {v}: {text}"
+        for v, d in count
+        for text in d.warnings
     ]
     found = Diagnostics(
-        trustworthy=all(d.trustworthy is not False for d in some),
+        trustworthy=all(d.trustworthy is not False for _, d in count),
         num_simulations=sum(d.num_simulations for d in known),
         num_missing=sum(d.num_missing for d in known),
-        effective_sample_size=min(e for e in effective if e is not None),
+        effective_sample_size=min(effective),
     )
-    return found.warned(*texts).extended(
+    found = found.extended(
         log_evidence=log_evidence,
-        probabilities=[
-            {"values": v.tolist(), "probability": float(p)}
-            for v, p in zip(belief.values, belief.probability, strict=True)
-        ],
+        probabilities=[{"values": v, "probability": p} for v, p in rows],
     )
+    return found.warned(*texts)

@@ -224,7 +224,7 @@ def refine_declared(problem: Problem, past: object) -> SimulatedBelief | None:
     num, missing = table.num_simulations - spent[0], table.num_missing - spent[1]
     belief.diagnostics = known.extended(num_simulations=num, num_missing=missing)
     belief.histories = DeclaredRecord((action, x), coordinates, table, pool)
-    warn_missing(missing, num, "their draws", stacklevel=5)
+    warn_missing(missing, num, "their draws")
     return belief
 
 

@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 from torch.distributions import Distribution
 from typing_extensions import override
@@ -130,71 +129,6 @@ class ActionRatio(ActionFactor):
 
 
 @dataclass(frozen=True)
-class TrainedRegion:
-    """Region where a network was trained; its values elsewhere mean nothing.
-
-    Attributes:
-        mixture: Mixture fitted to the rows.
-        floor: Log density of the mixture at the edge.
-    """
-
-    mixture: StudentMixture
-    floor: float
-
-    @staticmethod
-    def of(
-        z: Array, rng: np.random.Generator, *, lost: float = 2e-3, margin: float = 3.0
-    ) -> TrainedRegion:
-        """Return the region of rows, coordinates of shape (n, d).
-
-        Args:
-            z: The rows.
-            rng: Source of the choice of some.
-            lost: Share of the rows that may lie outside.
-            margin: Nats below the density of the last row inside.
-        """
-        mixture = _around(rng.permutation(z), rng)
-        floor = np.quantile(mixture.log_prob(z), lost) - margin
-        return TrainedRegion(mixture, float(floor))
-
-    def contains(self, z: Array) -> NDArray[np.bool_]:
-        """Return whether coordinates lie inside, (n, d) -> (n,)."""
-        return self.mixture.log_prob(z) >= self.floor
-
-
-def widened(
-    z: Array,
-    num_samples: int,
-    coordinates: PriorCoordinates,
-    rng: np.random.Generator,
-    *,
-    spread: float = 2.0,
-) -> Array:
-    """Return draws spread up to twice as wide as those of a belief, within the support.
-
-    The error of a belief may be as large as its width; a likelihood can be learned from
-    parameters of any distribution. Each component of a Gaussian mixture of z, shape (n,
-    d), is doubled, so that modes stay apart.
-    """
-    mixture = _around(z, rng)
-    factor = mixture.factors[mixture.log_parts(z).argmax(0)]
-    kept, missing = [], num_samples
-    while missing > 0:
-        i = rng.integers(len(z), size=2 * num_samples)
-        normal = rng.standard_normal((len(i), z.shape[1]))
-        step = np.sqrt(spread**2 - 1) * np.einsum("nij,nj->ni", factor[i], normal)
-        drawn = z[i] + step
-        kept.append(drawn[coordinates.inside(drawn)][:missing])
-        missing -= len(kept[-1])
-    return np.concatenate(kept)
-
-
-def _around(z: Array, rng: np.random.Generator) -> StudentMixture:
-    """Return a mixture fitted to rows (n, d), of components enough for a few modes."""
-    return fitted_normals(z[:2_000], 6, rng)
-
-
-@dataclass(frozen=True)
 class Product:
     r"""The learned likelihood of all trials, where it was learned.
 
@@ -208,14 +142,15 @@ class Product:
         coordinates: Coordinates of the prior.
         model: q, up to factors without theta.
         trials: The history.
-        region: R; None is the whole support.
+        region: Log density of the training rows, and its floor at the edge of R; None
+            is the whole support.
         previous: Belief that takes the prior's place, where beliefs are chained.
     """
 
     coordinates: PriorCoordinates
     model: ActionFactor
     trials: Sequence[Observation]
-    region: TrainedRegion | None = None
+    region: tuple[StudentMixture, float] | None = None
     previous: Distribution | None = None
 
     def log_likelihood(self, z: Array, *, batch_size: int = 20_000) -> Array:
@@ -223,7 +158,8 @@ class Product:
         total = np.full(len(z), -np.inf)
         inside = np.ones(len(z), dtype=bool)
         if self.region is not None:
-            inside = self.region.contains(z)
+            mixture, floor = self.region
+            inside = mixture.log_prob(z) >= floor
         if not inside.any():  # constraints of some priors cannot reshape no rows
             return total
         theta = self.coordinates.to_theta(z[inside])
@@ -249,6 +185,31 @@ class Product:
             return total
         ratio = self.previous.log_prob(theta) - self.coordinates.prior.log_prob(theta)
         return total + ratio.double()
+
+
+def trained_region(
+    z: Array,
+    rng: np.random.Generator,
+    *,
+    num_fitted: int = 2_000,
+    lost: float = 2e-3,
+    margin: float = 3.0,
+) -> tuple[StudentMixture, float]:
+    """Return the region of a network's training rows; elsewhere it means nothing.
+
+    Args:
+        z: Coordinates of the rows, shape (n, d).
+        rng: Source of the choice of some.
+        num_fitted: Number of rows that a mixture is fitted to, of components enough for
+            a few modes.
+        lost: Share of the rows that may lie outside.
+        margin: Nats below the density of the last row inside.
+
+    Returns:
+        A mixture, and its log density at the edge.
+    """
+    mixture = fitted_normals(rng.permutation(z)[:num_fitted], 6, rng)
+    return mixture, float(np.quantile(mixture.log_prob(z), lost)) - margin
 
 
 def sample_product(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from copy import deepcopy
 from typing import Any
 
@@ -13,7 +12,10 @@ from sbi.neural_nets.estimators.base import ConditionalDensityEstimator
 from sbi.sbi_types import Shape
 from torch import Tensor, nn
 
-from sbi_active.inference.networks.mixture_network import MixtureDensityNetwork
+from sbi_active.inference.networks.mixture_network import (
+    MISSING,
+    MixtureDensityNetwork,
+)
 from sbi_active.inference.rounds.condition import action_rows, outcome_rows, pack
 from sbi_active.messages import warn
 
@@ -163,9 +165,7 @@ class ActionPosterior:
         """Return sbi's posterior over x at an action (action_dim,), for diagnostics."""
         direct = self._direct()
         row = action_rows(action, self.action_dim, num_rows=1)
-        estimator = _Rewritten(
-            direct.posterior_estimator, self.x_shape, row, _with_action
-        )
+        estimator = _AtAction(direct.posterior_estimator, self.x_shape, row)
         return DirectPosterior(estimator, direct.prior)
 
     def _direct(self) -> DirectPosterior:
@@ -180,25 +180,23 @@ class ActionPosterior:
     def _given(self, x: Given, action: Given) -> tuple[Any, Tensor]:
         """Return a posterior of sbi's and the condition it takes.
 
-        sbi refuses NaN, which here says that nothing was measured. A network that
-        takes it is then given the number of a row in a table of the conditions.
+        sbi refuses NaN, which here says that nothing was measured: a network that takes
+        it is given another number for it.
         """
         condition = self._condition(x, action)
         if bool(condition.isfinite().all()) or not isinstance(
             self._packed, DirectPosterior
         ):
             return self._packed, condition
-        direct = self._packed
-        network = direct.posterior_estimator
+        network = self._packed.posterior_estimator
         if not isinstance(network, MixtureDensityNetwork):
-            return direct, condition  # sbi says what is wrong
+            return self._packed, condition  # sbi says what is wrong
         if not network.knows(condition):
             warn(
                 "SA107 the network has never seen an outcome like this: no simulation "
-                "it was trained on lacks these numbers, so what it says is arbitrary",
-                stacklevel=3,
+                "it was trained on lacks these numbers, so what it says is arbitrary"
             )
-        return at_conditions(direct, condition)
+        return self._packed, condition.nan_to_num(MISSING)
 
     def _condition(self, x: Given, action: Given) -> Tensor:
         if x is None or action is None:
@@ -212,56 +210,24 @@ class ActionPosterior:
         return pack(rows, action_rows(action, self.action_dim, num_rows=len(rows)))
 
 
-def at_conditions(
-    direct: DirectPosterior, condition: Tensor
-) -> tuple[DirectPosterior, Tensor]:
-    """Return a posterior given the number of a row, and these numbers.
-
-    sbi refuses NaN in a condition, and its diagnostics drop such rows; the number of a
-    row has none.
-
-    Args:
-        direct: Estimator over packed conditions.
-        condition: Packed conditions, shape (n, c).
-
-    Returns:
-        The posterior, and numbers of shape (n, 1).
-    """
-    posterior = DirectPosterior(
-        _Rewritten(direct.posterior_estimator, torch.Size([1]), condition, _row_of),
-        direct.prior,
-        max_sampling_batch_size=direct.max_sampling_batch_size,
-        device=direct.device,
-        enable_transform=direct.enable_transform,
-    )
-    return posterior, torch.arange(float(len(condition)))[:, None]
-
-
-class _Rewritten(ConditionalDensityEstimator):
-    """A packed estimator whose condition is made from another one.
+class _AtAction(ConditionalDensityEstimator):
+    """A packed estimator at one action, whose condition is x alone.
 
     Args:
         packed: Estimator over packed conditions.
-        shape: Shape of the conditions.
-        known: Tensor that conditions are made with.
-        rows: Function of conditions (n, *shape) and that, to (n, packed_dim).
+        x_shape: Shape of one outcome.
+        action: The action, shape (1, action_dim).
     """
 
     def __init__(
-        self,
-        packed: ConditionalDensityEstimator,
-        shape: torch.Size,
-        known: Tensor,
-        rows: Callable[[Tensor, Tensor], Tensor],
+        self, packed: ConditionalDensityEstimator, x_shape: torch.Size, action: Tensor
     ) -> None:
-        super().__init__(nn.Identity(), packed.input_shape, shape)
-        self.packed, self.rows = packed, rows
-        self.known = nn.Buffer(known)
+        super().__init__(nn.Identity(), packed.input_shape, x_shape)
+        self.packed, self.action = packed, nn.Buffer(action)
 
-    def _pack(self, given: Tensor) -> Tensor:
-        rows = self.rows(given.reshape(-1, *self.condition_shape), self.known)
-        leading = given.shape[: given.ndim - len(self.condition_shape)]
-        return rows.reshape(*leading, -1)
+    def _pack(self, x: Tensor) -> Tensor:
+        flat = x.flatten(x.ndim - len(self.condition_shape))
+        return torch.cat([flat, self.action[0].expand(*flat.shape[:-1], -1)], -1)
 
     def log_prob(self, input: Tensor, condition: Tensor, **kwargs: Any) -> Tensor:
         return self.packed.log_prob(input, self._pack(condition), **kwargs)
@@ -273,11 +239,3 @@ class _Rewritten(ConditionalDensityEstimator):
         self, sample_shape: torch.Size, condition: Tensor, **kwargs: Any
     ) -> Tensor:
         return self.packed.sample(sample_shape, self._pack(condition), **kwargs)
-
-
-def _with_action(x: Tensor, action: Tensor) -> Tensor:
-    return pack(x, action.expand(len(x), -1))
-
-
-def _row_of(number: Tensor, table: Tensor) -> Tensor:
-    return table[number[:, 0].long()]

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Literal, NamedTuple
 
 import torch
 from torch import Tensor, nn
 
-from sbi_active.inference.networks.action_scaling import ActionScaling, held_out
+from sbi_active.inference.networks.polynomials import held_out
 from sbi_active.inference.networks.response import Response
 
 
@@ -80,11 +81,11 @@ class Baseline(Response):
         test = held_out(len(u))
         self.centers = nn.Buffer(u[~test][:num_centers].clone())
 
-        self.residual_scaling: ActionScaling | None = None
+        self.residual_scaling: Response | None = None
         some = slice(num_scaled if kind == "curved" else None)
         frames = self(y[some], action[some])
         v = nearest(local(u[some], frames), frames)
-        self.residual_scaling = ActionScaling(v, action[some])
+        self.residual_scaling = Response.marginal(v, action[some])
 
     def forward(self, y: Tensor, action: Tensor, *, block: int = 4_096) -> Frames:
         """Return the frames of outcomes (n, m) and actions (n, action_dim)."""
@@ -99,13 +100,13 @@ class Baseline(Response):
         beta = beta @ whitener.mT
         if self.kind == "linear":
             start = torch.zeros_like(self.centers[:1]).expand(len(y), 1, -1)
-            misfit, gradient, precision = self._expand(start, y, beta)
-            mean = start - torch.linalg.solve(precision, gradient)
+            misfit, gradient, root = self._expand(start, y, beta)
+            mean = start - torch.linalg.solve(root.mT @ root, gradient)
             # No clamp to the rows' range here: the linear f holds everywhere.
             misfit = misfit + 0.5 * (gradient * (mean - start)).sum(-1)
         else:
-            mean, misfit, precision = self._minimize(y, beta)
-        factor = precision_factor(precision).mT
+            mean, misfit, root = self._minimize(y, beta)
+        factor = upper_factor(root)
         if self.residual_scaling is not None:
             location, scale = self.residual_scaling.location_and_scale(action)
             location = location[:, None, :, None]
@@ -114,19 +115,19 @@ class Baseline(Response):
         return Frames(mean, factor, misfit)
 
     def _minimize(self, y: Tensor, beta: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return solution, misfit and precision of two starts a row."""
+        """Return solution, misfit and root of the precision of two starts a row."""
         residual = y[:, None] - self.parameter_basis(self.centers) @ beta
         misfit = 0.5 * (residual.square().sum(-1) + self.centers.square().sum(-1))
         first = self._descend(self.centers[misfit.argmin(1)][:, None], y, beta)
         # Distances of the centers to the quadratic around the first solution.
         step = self.centers - first[0]
-        quadratic = (step * (step @ first[2][:, 0])).sum(-1) * 0.5 + first[1]
+        quadratic = (step @ first[2][:, 0].mT).square().sum(-1) * 0.5 + first[1]
         second = (misfit.log() - quadratic.clamp_min(1e-12).log()).argmin(1)
         second = self._descend(self.centers[second][:, None], y, beta)
-        mean, misfit, precision = (
-            torch.cat(pair, 1) for pair in zip(first, second, strict=True)
+        mean, misfit, root = map(
+            partial(torch.cat, dim=1), zip(first, second, strict=True)
         )
-        return mean, misfit, precision
+        return mean, misfit, root
 
     def _descend(
         self,
@@ -148,62 +149,47 @@ class Baseline(Response):
         state = (u, *self._expand(u, y, beta))
         rows = torch.arange(len(u), device=u.device)  # not yet at rest
         for _ in range(num_steps):
-            u, misfit, gradient, precision = (each[rows] for each in state)
-            diagonal = precision.diagonal(dim1=-2, dim2=-1)
-            damped = precision + torch.diag_embed(damping * diagonal)
+            u, misfit, gradient, root = own = [each[rows] for each in state]
+            diagonal = root.square().sum(-2)
+            damped = root.mT @ root + torch.diag_embed(damping * diagonal)
             proposed = u - torch.linalg.solve(damped, gradient)
             proposed = torch.minimum(torch.maximum(proposed, low), high)
             new = (proposed, *self._expand(proposed, y[rows], beta[rows]))
             better = new[1] < misfit
-            state = tuple(
-                each.index_put((rows,), torch.where(_like(better, b), b, a))
-                for each, a, b in zip(
-                    state, (u, misfit, gradient, precision), new, strict=True
-                )
-            )
+            for k, (a, b) in enumerate(zip(own, new, strict=True)):
+                is_new = better.reshape(*better.shape, *[1] * (a.ndim - 2))
+                state[k][rows] = torch.where(is_new, b, a)
             restless = ~(better & (misfit - new[1] < at_rest)).all(1)
             damping = torch.where(better[..., None], 0.1 * damping, 10.0 * damping)
             rows, damping = rows[restless], damping[restless]
-            if not len(rows):
-                break
         return state[0], state[1], state[3]
 
     def _expand(
         self, u: Tensor, y: Tensor, beta: Tensor
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Return misfit (n, J), its gradient (n, J, d) and Gauss-Newton Hessian."""
+        """Return misfit (n, J), its gradient (n, J, d) and a root of its Hessian.
+
+        The root is (I, J) stacked, of Gauss and Newton's Hessian, (n, J, d + m, d).
+        """
         psi, slope = self.parameter_basis.with_jacobian(u)
         residual = y[:, None] - psi @ beta
-        jacobian = slope.mT @ beta[:, None]  # (n, J, d, m)
+        jacobian = beta[:, None].mT @ slope  # (n, J, m, d)
         misfit = 0.5 * (residual.square().sum(-1) + u.square().sum(-1))
-        gradient = u - (jacobian @ residual[..., None])[..., 0]
+        gradient = u - (residual[..., None, :] @ jacobian)[..., 0, :]
         eye = torch.eye(u.shape[-1], dtype=u.dtype, device=u.device)
-        return misfit, gradient, eye + jacobian @ jacobian.mT
+        eye = eye.expand(*u.shape, -1)
+        return misfit, gradient, torch.cat([eye, jacobian], -2)
 
 
-def precision_factor(precision: Tensor) -> Tensor:
-    """Return the lower factor of I + J J^T, which rounding may have made indefinite.
+def upper_factor(root: Tensor) -> Tensor:
+    """Return U of a positive diagonal, with U^T U = A^T A for A (..., n, d).
 
-    This happens where noise is extrapolated to nearly nothing; a share of the largest
-    entry, raised until it suffices, then stands for the lost I.
+    A product A^T A would lose the identity in A where noise is nearly nothing.
     """
-    factor, info = torch.linalg.cholesky_ex(precision)
-    share = 1e-14
-    while bool(info.any()):
-        if share > 1.0:  # which suffices for any finite one
-            raise ValueError(
-                "expected a regression of the outcomes with finite weights; got "
-                "infinite or undefined ones; check the outcomes for numbers beyond "
-                "any use"
-            )
-        largest = precision.diagonal(dim1=-2, dim2=-1).amax(-1, keepdim=True)
-        lifted = precision + torch.diag_embed(
-            (share * largest).expand_as(factor[..., 0])
-        )
-        lost = (info > 0)[..., None, None]
-        factor, info = torch.linalg.cholesky_ex(torch.where(lost, lifted, precision))
-        share *= 10.0
-    return factor
+    upper = torch.linalg.qr(root, mode="r").R
+    return (
+        upper * torch.where(upper.diagonal(dim1=-2, dim2=-1) < 0, -1.0, 1.0)[..., None]
+    )
 
 
 def local(u: Tensor, frames: Frames) -> Tensor:
@@ -216,7 +202,3 @@ def nearest(v: Tensor, frames: Frames) -> Tensor:
     """Return v in the frame of highest density, (n, J, d) -> (n, d)."""
     log_density = frames.log_det - 0.5 * v.square().sum(-1)
     return v[torch.arange(len(v)), log_density.argmax(1)]
-
-
-def _like(mask: Tensor, values: Tensor) -> Tensor:
-    return mask.reshape(*mask.shape, *[1] * (values.ndim - mask.ndim))

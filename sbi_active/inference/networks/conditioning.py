@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from typing import Literal
 
 import numpy as np
@@ -10,8 +9,9 @@ import torch
 from torch import Tensor, nn
 
 from sbi_active.arrays import finite
-from sbi_active.inference.networks.action_scaling import ActionScaling, held_out
 from sbi_active.inference.networks.baseline import Baseline, Frames, local
+from sbi_active.inference.networks.polynomials import held_out
+from sbi_active.inference.networks.response import Response, log_normal
 
 
 def can_regress(
@@ -39,7 +39,7 @@ class Whitening(nn.Module):
     def __init__(self, theta: Tensor, *, full: bool) -> None:
         super().__init__()
         theta = theta.double()
-        mean, scale = theta.mean(0), scale_of(theta)
+        mean, scale = moments(theta)
         factor = scale.diag()
         if full and len(theta) > len(scale):
             z = (theta - mean) / scale
@@ -155,11 +155,10 @@ class Conditioning(nn.Module):
         condition: Packed (x, action), shape (n, x_dim + action_dim); NaN in x where
             there was no measurement.
         action_dim: Numbers in an action.
-        scaling: Whether x, without a baseline, is standardized given the action or over
-            all rows.
         whiten: Whether theta is whitened by its full covariance or only scaled.
-        baseline: Whether a baseline's frames are used; "best" compares Gaussian log
-            scores on held-out rows, without one among them.
+        adapts: Whether a baseline's frames are used, the linear or the curved one or
+            none by Gaussian log scores on held-out rows; otherwise all is scaled over
+            all rows.
         most_numbers: Number of an outcome's numbers beyond which
             :class:`.Directions` stand for them. Half of it summarizes what a network
             learns as well in ten times the time.
@@ -176,11 +175,10 @@ class Conditioning(nn.Module):
         theta: Tensor,
         condition: Tensor,
         action_dim: int,
-        scaling: Literal["action", "global"],
-        whiten: bool,
-        baseline: Literal["best", "none"],
         *,
-        most_numbers: float = 200,
+        whiten: bool,
+        adapts: bool,
+        most_numbers: int = 200,
         num_directions: int = 32,
         margin: float = 0.25,
     ) -> None:
@@ -190,32 +188,22 @@ class Conditioning(nn.Module):
         x, action = condition.split([self.x_dim, action_dim], 1)
         valid = finite(x).all(1)
         self.directions: Directions | None = None
-        if self.x_dim > most_numbers and can_regress(valid, num_directions):
+        if adapts and self.x_dim > most_numbers and can_regress(valid, num_directions):
             some = slice(None) if bool(valid.all()) else valid  # without a copy
             own = self.whiten(theta[some]), x[some], action[some]
             self.directions = Directions(*own, num=num_directions)
         x, action = self._summarized(x), action.double()
-        few = not can_regress(valid, x.shape[1])
-        self.action_mean = nn.Buffer(action.mean(0))
-        self.action_scale = nn.Buffer(scale_of(action))
-        columns = [x[row, j] for j, row in enumerate(x.isfinite().mT)]
-        center = [c.mean() if len(c) else x.new_zeros(()) for c in columns]
-        spread = [scale_of(c) if len(c) else x.new_ones(()) for c in columns]
-        self.y_mean = nn.Buffer(torch.stack(center))
-        self.y_scale = nn.Buffer(torch.stack(spread))
-        y = (x[valid] - self.y_mean) / self.y_scale
-
+        self.action_mean, self.action_scale = map(nn.Buffer, moments(action))
+        self.y_mean, self.y_scale = map(nn.Buffer, moments(x))
         self.baseline: Baseline | None = None
-        if baseline == "best" and not few:
+        self.x_scaling: Response | None = None
+        if adapts and can_regress(valid, x.shape[1]):
+            y = (x[valid] - self.y_mean) / self.y_scale
             self._choose(self.whiten(theta[valid]), y, action[valid], margin)
-        self.x_scaling: ActionScaling | None = None
-        if scaling == "action" and not few and self.baseline is None:
-            self.x_scaling = ActionScaling(y, action[valid])
 
     def _summarized(self, x: Tensor) -> Tensor:
         """Return outcomes as they are, or a few directions of them, (n, k)."""
-        own = getattr(self, "directions", None)  # none in networks of earlier versions
-        return x.double() if own is None else own(x)
+        return x.double() if self.directions is None else self.directions(x)
 
     def _choose(self, u: Tensor, y: Tensor, action: Tensor, margin: float) -> None:
         """Take the baseline that predicts held-out rows best, if one does better."""
@@ -231,6 +219,8 @@ class Conditioning(nn.Module):
             score = float(_log_mixture(u[test], frames).mean())
             if score > best + least:
                 best, self.baseline = score, candidate
+        if self.baseline is None:
+            self.x_scaling = Response.marginal(y, action)
 
     @property
     def num_frames(self) -> int:
@@ -251,9 +241,10 @@ class Conditioning(nn.Module):
         x, action = self._summarized(x), action.double()
         missing = ~x.isfinite()
         # Missing numbers are replaced before any arithmetic, lest gradients be NaN.
-        y = (torch.where(missing, self.y_mean, x) - self.y_mean) / self.y_scale
-        scaled = y if self.x_scaling is None else self.x_scaling(y, action)
-        scaled = torch.where(missing, 0.0, scaled)
+        scaled = y = (torch.where(missing, self.y_mean, x) - self.y_mean) / self.y_scale
+        if self.x_scaling is not None:
+            location, scale = self.x_scaling.location_and_scale(action)
+            scaled = torch.where(missing, 0.0, (y - location) / scale)
         seen = [scaled, (action - self.action_mean) / self.action_scale]
         trivial = Frames.trivial(y, len(self.whiten.mean))
         if self.baseline is None:
@@ -271,11 +262,6 @@ class Conditioning(nn.Module):
         return torch.cat(seen, 1), frames.with_global()
 
 
-def log_normal(u: Tensor) -> Tensor:
-    """Return the log density of the standard normal, (..., d) -> (...)."""
-    return -0.5 * u.square().sum(-1) - 0.5 * u.shape[-1] * math.log(2 * math.pi)
-
-
 def _log_mixture(u: Tensor, frames: Frames) -> Tensor:
     """Log density of the local frames, equally weighted, with 1 % of the global one."""
     log_density = frames.log_det + log_normal(local(u, frames))
@@ -284,7 +270,14 @@ def _log_mixture(u: Tensor, frames: Frames) -> Tensor:
     return (log_density + weight.to(u).log()).logsumexp(-1)
 
 
-def scale_of(rows: Tensor) -> Tensor:
-    """Return the columns' standard deviations, one where a column is constant."""
-    scale, mean = rows.std(0, correction=0), rows.mean(0)
-    return torch.where(scale > 1e-12 * (1.0 + mean.abs()), scale, 1.0)
+def moments(rows: Tensor) -> tuple[Tensor, Tensor]:
+    """Return mean and deviation of the finite numbers of each column, float64 (d,).
+
+    A column that is constant, or has no finite number, carries nothing: divided by one
+    it keeps at zero.
+    """
+    known = finite(rows)
+    count, rows = known.sum(0).clamp_min(1), rows.double()
+    mean = torch.where(known, rows, 0.0).sum(0) / count
+    scale = (torch.where(known, rows - mean, 0.0).square().sum(0) / count).sqrt()
+    return mean, torch.where(scale > 1e-12 * (1.0 + mean.abs()), scale, 1.0)

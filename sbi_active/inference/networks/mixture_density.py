@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable
 from copy import deepcopy
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 from torch import Tensor, nn
@@ -34,29 +34,26 @@ class MixtureDetails:
         activation: Function between layers, "silu" or "relu". The smooth one reaches
             the same loss in half of the steps.
         anneal: Whether the learning rate falls to zero along a cosine.
-        scaling: Scaling of x: "action" standardizes it given the action, "global" over
-            all rows; with a baseline, that does the former.
-        whiten: Whether theta is whitened by its full covariance, or number by number.
-        baseline: Gaussian posterior that the network corrects: "none", or the "best" on
-            held-out rows of one linear or curved in theta, see :class:`.Conditioning`.
+        baseline: Gaussian posterior that the network corrects: the "best" on held-out
+            rows of one linear or curved in theta, see :class:`.Conditioning`; "none"
+            standardizes each number over all rows alone.
     """
 
     batch_size: int = 200
     learning_rate: float = 1.5e-2
     activation: Literal["silu", "relu"] = "silu"
     anneal: bool = True
-    scaling: Literal["action", "global"] = "action"
-    whiten: bool = True
     baseline: Literal["best", "none"] = "best"
 
     def __post_init__(self) -> None:
         require_least(self, "raise it", batch_size=1)
         rate = self.learning_rate
         require(rate > 0, "learning_rate > 0", rate, "use 1e-3")
-        require_one_of(self, activation=ACTIVATIONS, scaling=("action", "global"))
-        require_one_of(self, baseline=("best", "none"))
+        require_one_of(self, activation=ACTIVATIONS, baseline=("best", "none"))
 
 
+#: Number of epochs that sbi's own default allows.
+NEVER = 2**31 - 1
 #: Settings whose fields were the network's own in the last version.
 GROUPS = {"details": MixtureDetails}
 
@@ -117,11 +114,21 @@ class MixtureDensity:
                 learning_rate=1e-3,
                 activation="relu",
                 anneal=False,
-                scaling="global",
-                whiten=False,
                 baseline="none",
             ),
         )
+
+    @property
+    def training(self) -> dict[str, Any]:
+        """Arguments of sbi's ``train``: it ends by a number of iterations alone."""
+        own = self.details
+        how = {"training_batch_size": own.batch_size, "stop_after_epochs": NEVER}
+        return {"learning_rate": own.learning_rate, **how}
+
+    @property
+    def anneal(self) -> bool:
+        """Whether the learning rate falls to zero along a cosine."""
+        return self.details.anneal
 
     def __call__(self, theta: Tensor, x: Tensor) -> MixtureDensityNetwork:
         """Build the network on rows standardized number by number, as in sbi.
@@ -152,11 +159,11 @@ class TrainingRecord:
     seconds: list[float] = field(default_factory=list)
 
 
-def train_mixture_density(
-    network: MixtureDensityNetwork,
+def train_network(
+    network: nn.Module,
     optimizer: Adam,
-    theta: Tensor,
-    condition: Tensor,
+    row_loss: Callable[[Tensor, Tensor], Tensor],
+    rows: tuple[Tensor, Tensor],
     *,
     train_rows: Tensor,
     held_out_rows: Tensor,
@@ -164,27 +171,25 @@ def train_mixture_density(
     batch_size: int,
     clip_max_norm: float | None = 5.0,
     anneal: bool = False,
-    patience: int | None = None,
+    patience: int = NEVER,
 ) -> TrainingRecord:
-    r"""Minimize :math:`-\sum_n \log q(\theta_n | c_n)` over the training rows.
+    r"""Minimize a loss over the training rows, and end with the best held-out weights.
 
     sbi's loop passes every row through a DataLoader, which costs more than the network;
-    this one indexes tensors. Rows go through a network's conditioning once, and such a
-    network ends with its best weights on the held-out rows.
+    this one indexes tensors.
 
     Args:
         network: Network that is changed in place.
         optimizer: Optimizer of the network's parameters.
-        theta: Parameters, shape (n, theta_dim).
-        condition: Conditions, shape (n, condition_dim).
+        row_loss: Loss of rows, (n, ...) and (n, ...) -> (n,), or their mean.
+        rows: What the loss takes.
         train_rows: Indices of rows to train on.
         held_out_rows: Indices of rows to validate on; may be empty.
         num_iterations: Steps of gradient descent.
         batch_size: Rows a step.
         clip_max_norm: Bound of the gradient's norm; None does not clip.
         anneal: Whether the learning rate falls to zero along a cosine.
-        patience: Epochs without improvement on held-out rows after which training
-            stops and the best weights return; None spends the whole budget.
+        patience: Epochs without improvement on held-out rows that end it.
 
     Returns:
         The losses.
@@ -192,30 +197,22 @@ def train_mixture_density(
     Raises:
         RuntimeError: If the loss is not finite.
     """
-    row_loss: Callable[[Tensor, Tensor], Tensor] = network.loss
-    if network.conditioning is not None and patience is None:
-        patience = num_iterations  # never runs out
-    if network.can_prepare:
-        theta, condition = network.prepare(theta, condition)
-        row_loss = network.prepared_loss
 
     def height(step: int) -> float:
         return 1 + math.cos(math.pi * step / num_iterations)
 
     optimizer.rate = optimizer.initial_rate  # resumed: an annealed one starts again
     size = min(batch_size, len(train_rows))
-    steps_an_epoch = len(train_rows) // size
-    record, best, best_state, fruitless, done = TrainingRecord(), torch.inf, None, 0, 0
-    while done < num_iterations and fruitless != patience:
-        start, total = time.time(), theta.new_zeros(())
+    record, best, fruitless, done = TrainingRecord(), torch.inf, 0, 0
+    best_state = network.state_dict()
+    held_out = [part[held_out_rows] for part in rows]
+    while done < num_iterations and fruitless < patience:
+        start, losses = time.time(), []
         network.train()
-        num_steps = min(steps_an_epoch, num_iterations - done)
+        num_steps = min(len(train_rows) // size, num_iterations - done)
         order = train_rows[torch.randperm(len(train_rows))][: num_steps * size]
         # One gather an epoch: indexing rows at every step costs a tenth of the step.
-        batches = zip(
-            theta[order].split(size), condition[order].split(size), strict=True
-        )
-        for batch in batches:
+        for batch in zip(*(part[order].split(size) for part in rows), strict=True):
             optimizer.forget_gradients()
             loss = row_loss(*batch).mean()
             loss.backward()
@@ -225,30 +222,25 @@ def train_mixture_density(
             done += 1
             if anneal:
                 optimizer.rate *= height(done) / height(done - 1)
-            total += loss.detach()
-
+            losses.append(loss.detach())
         network.eval()
-        training_loss = validation_loss = float(total) / num_steps
+        validation_loss = training_loss = float(torch.stack(losses).mean())
         if len(held_out_rows):
             with torch.no_grad():
-                held_out = theta[held_out_rows], condition[held_out_rows]
                 validation_loss = float(row_loss(*held_out).mean())
-        if not abs(validation_loss) < torch.inf:
+        if not math.isfinite(validation_loss):
             raise RuntimeError(
                 f"expected a finite loss; got {validation_loss} after {done} "
                 "iterations; lower learning_rate, or look for numbers in x far "
                 "from all others"
             )
+        fruitless += 1
         if validation_loss < best:
             best, fruitless = validation_loss, 0
-            if patience is not None:
-                best_state = deepcopy(network.state_dict())
-        else:
-            fruitless += 1
+            best_state = deepcopy(network.state_dict())
         record.training_loss.append(training_loss)
         record.validation_loss.append(validation_loss)
         record.seconds.append(time.time() - start)
-    if best_state is not None:
-        network.load_state_dict(best_state)
+    network.load_state_dict(best_state)
     network.zero_grad(set_to_none=True)
     return record

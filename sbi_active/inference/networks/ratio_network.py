@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any, ClassVar
 
 import torch
 from sbi.neural_nets.ratio_estimators import RatioEstimator
 from torch import Tensor, nn
 
 from sbi_active.expected import require, require_least
-from sbi_active.inference.networks.action_scaling import ActionScaling
-from sbi_active.inference.networks.conditioning import Whitening, can_regress, scale_of
+from sbi_active.inference.networks.conditioning import Whitening, can_regress, moments
+from sbi_active.inference.networks.mixture_network import layers
 from sbi_active.inference.networks.response import Response
 
 
@@ -31,6 +32,16 @@ class RatioClassifier:
     learning_rate: float = 2e-3
     num_iterations: int = 400
     stop_after_epochs: int = 20
+    anneal: ClassVar[bool] = False
+
+    @property
+    def training(self) -> dict[str, Any]:
+        """Arguments of sbi's ``train``."""
+        return {
+            "training_batch_size": self.batch_size,
+            "learning_rate": self.learning_rate,
+            "stop_after_epochs": self.stop_after_epochs,
+        }
 
     def __post_init__(self) -> None:
         names = ("hidden_features", "batch_size", "num_iterations", "stop_after_epochs")
@@ -44,12 +55,11 @@ class RatioNetwork(RatioEstimator):
 
     .. math::
         \log r(\theta; x, \xi) = \log \mathcal N(x; f(\xi, \theta), S(\xi))
-        - \log \mathcal N(x; \mu(\xi), \sigma^2(\xi)) + g(\theta, x, \xi),
+        - \log \mathcal N(x; \mu(\xi), S_0(\xi)) + g(\theta, x, \xi),
 
-    with f and S of a :class:`.Response`, and the second
-    density the outcome standardized given the action. A classifier alone learns ratios
-    of a few nats; here it starts where the regression is. An outcome without a
-    measurement has the ratio g.
+    both of a :class:`.Response`, the second of one to the action alone. A classifier
+    alone learns ratios of a few nats; here it starts where the regression is. An
+    outcome without a measurement has the ratio g.
 
     Args:
         settings: Layers of g.
@@ -69,33 +79,20 @@ class RatioNetwork(RatioEstimator):
         x_dim, dim = condition.shape[1] - action_dim, theta.shape[1]
         x, action = condition.double().split([x_dim, action_dim], 1)
         valid = x.isfinite().all(1)
-        with_baseline = can_regress(valid, x_dim)
-        width = dim + action_dim + x_dim * (2 if with_baseline else 1) + 1
-        layers: list[nn.Module] = []
-        for hidden in settings.hidden_features:
-            layers += [nn.Linear(width, hidden), nn.ReLU()]
-            width = hidden
-        last = nn.Linear(width, 1)
-        super().__init__(
-            nn.Sequential(*layers, last), theta.shape[1:], condition.shape[1:]
-        )
-        with torch.no_grad():  # start at the regression's ratio
-            last.weight.mul_(0.1)
-            last.bias.zero_()
+        regresses = can_regress(valid, x_dim)
+        width = dim + action_dim + x_dim * (2 if regresses else 1) + 1
+        net = layers(width, settings.hidden_features, 1, nn.ReLU)
+        super().__init__(net, theta.shape[1:], condition.shape[1:])
         self._x_dim = x_dim
         self.whiten = Whitening(theta, full=True)
-        self.action_mean = nn.Buffer(action.mean(0))
-        self.action_scale = nn.Buffer(scale_of(action))
-        known = x[valid]
-        enough = len(known) > 1
-        self.y_mean = nn.Buffer(known.mean(0) if enough else torch.zeros(x_dim))
-        self.y_scale = nn.Buffer(scale_of(known) if enough else torch.ones(x_dim))
+        self.action_mean, self.action_scale = map(nn.Buffer, moments(action))
+        self.y_mean, self.y_scale = map(nn.Buffer, moments(x[valid]))
         self.response: Response | None = None
-        self.x_scaling: ActionScaling | None = None
-        if with_baseline:
-            y = (known - self.y_mean) / self.y_scale
+        self.marginal: Response | None = None
+        if regresses:
+            y = (x[valid] - self.y_mean) / self.y_scale
             self.response = Response.best(self.whiten(theta[valid]), y, action[valid])
-            self.x_scaling = ActionScaling(y, action[valid])
+            self.marginal = Response.marginal(y, action[valid])
 
     def unnormalized_log_ratio(self, theta: Tensor, x: Tensor) -> Tensor:
         """Return log ratios of theta (..., d) and packed (x, action) (..., c)."""
@@ -111,18 +108,14 @@ class RatioNetwork(RatioEstimator):
         valid = x.isfinite().all(1)
         y = (torch.where(valid[:, None], x, self.y_mean) - self.y_mean) / self.y_scale
         u = self.whiten(theta)
-        seen = [u, (action - self.action_mean) / self.action_scale]
-        base = torch.zeros(len(theta), dtype=torch.float64)
-        if self.response is None or self.x_scaling is None:
-            seen.append(y)
-        else:
-            location, scale = self.x_scaling.location_and_scale(action)
-            wide = (y - location) / scale
+        base, outcome = torch.zeros_like(u[:, 0]), y
+        if self.response is not None and self.marginal is not None:
             sharp, log_det = self.response.standardize(u, y, action)
-            base = log_det + scale.log().sum(1)
+            wide, log_det_wide = self.marginal.standardize(u[:, :1], y, action)
+            base = log_det - log_det_wide
             base = base + 0.5 * (wide.square().sum(1) - sharp.square().sum(1))
-            seen += [wide, far * torch.tanh(sharp / far)]
-        inside = torch.cat(seen[2:], 1) * valid[:, None]
-        parts = torch.cat([*seen[:2], inside, valid[:, None].double()], 1)
-        correction = self.net(parts.float())[:, 0]
+            outcome = torch.cat([wide, far * torch.tanh(sharp / far)], 1)
+        action = (action - self.action_mean) / self.action_scale
+        seen = [u, action, outcome * valid[:, None], valid[:, None]]
+        correction = self.net(torch.cat(seen, 1).float())[:, 0]
         return torch.where(valid, base, 0.0).float() + correction

@@ -8,7 +8,7 @@ from typing import Literal
 import torch
 from torch import Tensor, nn
 
-from sbi_active.inference.networks.action_scaling import (
+from sbi_active.inference.networks.polynomials import (
     SMALLEST_SCALE,
     Polynomials,
     best_prefix,
@@ -63,25 +63,18 @@ class Response(nn.Module):
         # A degree more than there is data for costs nothing: terms are cut off below.
         inner, _ = exponents_of(u, max_degree=degree, max_terms=max(1 + dim, most))
         self.action_basis = Polynomials(action, exponents)
-        self.parameter_basis = Polynomials(u, inner)
-        phi, psi = self.action_basis(action), self.parameter_basis(u)
+        phi, psi = self.action_basis(action), Polynomials(u, inner)(u)
         degrees = min(len(sizes), max_noise_degree + 1)
         noise = phi[:, : sizes[degrees - 1]]
-
         k, j, prefixes = _joint_terms(exponents, inner, most, max_degree)
+        design = phi[:, k] * psi[:, j]
         beta, gamma = fit_location_and_scale(
-            phi[:, k] * psi[:, j],
-            prefixes,
-            noise,
-            sizes[:degrees],
-            y,
-            test,
-            num_iterations=3,
+            design, prefixes, noise, sizes[:degrees], y, test
         )
         # Between rows that lie apart a polynomial may dive to any depth.
         floor = SMALLEST_SCALE * y.std(0, correction=0).clamp_min(SMALLEST_SCALE)
         log_sigma = torch.maximum(noise @ gamma, floor.log())
-        z = (y - (phi[:, k] * psi[:, j]) @ beta) / log_sigma.exp()
+        z = (y - design @ beta) / log_sigma.exp()
         z = z.clamp(-5.0, 5.0)  # few wild rows must not set the correlations
         correlation = torch.corrcoef(z.T).reshape(y.shape[1], -1).nan_to_num(0.0)
         correlation.fill_diagonal_(1.0)
@@ -114,6 +107,20 @@ class Response(nn.Module):
         gain = curved.log_prob(*rows) - linear.log_prob(*rows)
         return curved if exceeds_chance(gain) else linear
 
+    @staticmethod
+    def marginal(y: Tensor, action: Tensor) -> Response:
+        """Return the regression on the action alone, of parameters that never vary."""
+        return Response(y.new_zeros(len(y), 1), y, action, kind="linear")
+
+    def location_and_scale(self, action: Tensor) -> tuple[Tensor, Tensor]:
+        """Return f at the middle of the parameters, and the noise, each (n, m)."""
+        phi = self.action_basis(action)
+        return phi @ self.beta[:, 0], self._log_sigma(phi).exp()
+
+    def _log_sigma(self, phi: Tensor) -> Tensor:
+        log_sigma = phi[:, : len(self.gamma)] @ self.gamma
+        return log_sigma.clamp(self.log_low, self.log_high)
+
     def weights(self, action: Tensor) -> tuple[Tensor, Tensor]:
         r"""Return the whitener of an action's noise, and f's weights.
 
@@ -121,9 +128,7 @@ class Response(nn.Module):
         :math:`\psi(u)`, in the outcome's own units, shape (n, p, m).
         """
         phi = self.action_basis(action)
-        log_sigma = phi[:, : len(self.gamma)] @ self.gamma
-        log_sigma = log_sigma.clamp(self.log_low, self.log_high)
-        whitener = self.whitener / log_sigma.exp()[:, None, :]
+        whitener = self.whitener / self._log_sigma(phi).exp()[:, None, :]
         return whitener, (phi @ self.beta.flatten(1)).unflatten(1, self.beta.shape[1:])
 
     def mean_and_whitener(self, u: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
@@ -142,8 +147,7 @@ class Response(nn.Module):
     def log_prob(self, u: Tensor, y: Tensor, action: Tensor) -> Tensor:
         """Return the Gaussian log density of outcomes, shape (n,)."""
         z, log_det = self.standardize(u, y, action)
-        constant = 0.5 * z.shape[1] * math.log(2 * math.pi)
-        return log_det - 0.5 * z.square().sum(1) - constant
+        return log_det + log_normal(z)
 
     def bends(
         self, u: Tensor, y: Tensor, action: Tensor, *, straight: float = 0.01
@@ -153,23 +157,22 @@ class Response(nn.Module):
         Below that f is taken to be linear.
         """
         test = held_out(len(u))
-        phi = self.action_basis(action)
-        predicted = torch.einsum(
-            "nk,kjm,nj->nm", phi, self.beta, self.parameter_basis(u)
-        )
-        z = (y - predicted) / (phi[:, : len(self.gamma)] @ self.gamma).exp()
-        z = z.clamp(-5.0, 5.0)
-        few = phi[:, : max(4, 1 + action.shape[1])]
+        z = self.standardize(u, y, action)[0].clamp(-5.0, 5.0)
+        few = self.action_basis(action)[:, : max(4, 1 + action.shape[1])]
         most = int((~test).sum()) // (10 * few.shape[1])
         exponents, sizes = exponents_of(
             u, max_degree=3, max_terms=max(1, min(40, most))
         )
-        design = Polynomials(u, exponents)(u)[..., None] * few[:, None]
-        design = design.flatten(1)
+        design = (Polynomials(u, exponents)(u)[..., None] * few[:, None]).flatten(1)
         sizes = [size * few.shape[1] for size in sizes]
         left = z[test] - design[test] @ best_prefix(design, sizes, z, test)
         share = (1 - left.square().mean(0) / z[test].square().mean(0)).max()
         return float(share) > straight
+
+
+def log_normal(u: Tensor) -> Tensor:
+    """Return the log density of the standard normal, (..., d) -> (...)."""
+    return -0.5 * u.square().sum(-1) - 0.5 * u.shape[-1] * math.log(2 * math.pi)
 
 
 def exceeds_chance(gain: Tensor) -> bool:

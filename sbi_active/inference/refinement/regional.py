@@ -85,7 +85,7 @@ class Regions(Stages):
         )
         belief.histories = histories.record()
         spent, lost = histories.num_simulations, histories.num_missing
-        warn_missing(lost, spent, "the histories they belong to", stacklevel=4)
+        warn_missing(lost, spent, "the histories they belong to")
         return belief
 
     def _propose(self, stage: Stage, size: int) -> None:

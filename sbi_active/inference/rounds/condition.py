@@ -20,12 +20,6 @@ def pack(x: Tensor, action: Tensor) -> Tensor:
     return torch.cat([x.flatten(1), action], dim=-1)
 
 
-def unpack(condition: Tensor, x_shape: Sequence[int]) -> tuple[Tensor, Tensor]:
-    """Return x, shape (n, *x_shape), and the action, shape (n, action_dim)."""
-    x_dim = torch.Size(x_shape).numel()
-    return condition[:, :x_dim].reshape(-1, *x_shape), condition[:, x_dim:]
-
-
 def action_rows(
     action: Tensor, action_dim: int | None, *, num_rows: int | None = None
 ) -> Tensor:
@@ -116,5 +110,5 @@ class ActionEmbedding(nn.Module):
                 f"{tuple(self.x_shape)} and {self.action_dim} of the action; got "
                 f"{condition.shape[-1]}; check x_shape and action_dim"
             )
-        x, action = unpack(condition, self.x_shape)
-        return torch.cat([self.net(x), action], dim=-1)
+        x, action = condition.tensor_split([self.x_shape.numel()], 1)
+        return torch.cat([self.net(x.reshape(-1, *self.x_shape)), action], dim=-1)

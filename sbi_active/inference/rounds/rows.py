@@ -12,9 +12,7 @@ from sbi.utils import RestrictedPrior
 from torch import Tensor
 from torch.distributions import Distribution
 
-from sbi_active.arrays import finite
 from sbi_active.expected import require
-from sbi_active.inference.rounds.condition import action_rows, outcome_rows
 from sbi_active.messages import Explained, warn
 from sbi_active.simulation.outcomes import (
     MissingRowsWarning,
@@ -23,7 +21,6 @@ from sbi_active.simulation.outcomes import (
 )
 from sbi_active.simulation.workers.engine import simulate
 from sbi_active.simulation.workers.settings import Workers
-from sbi_active.support import parameter_dim, within_support
 
 
 class UnexplainedOutcomeError(Explained, ValueError):
@@ -44,75 +41,6 @@ class Observation:
 
     action: Tensor
     x: Tensor
-
-
-def round_rows(
-    theta: Tensor,
-    x: Tensor,
-    action: Tensor,
-    *,
-    prior: Distribution,
-    x_shape: torch.Size | None,
-    action_dim: int | None,
-    exclude_invalid: bool,
-    may_be_invalid: bool = False,
-) -> Simulations:
-    """Return the rows of a round in float32, or say what is wrong with them.
-
-    Outcomes may be gigabytes: who keeps them makes a copy.
-
-    Args:
-        theta: Parameters, shape (n, theta_dim), within the prior's support.
-        x: Outcomes, shape (n, *x_shape), or (n,) where x is one number.
-        action: Actions, shape (n, action_dim), or (action_dim,) for all rows.
-        prior: Prior that gives theta_dim and the support.
-        x_shape: Shape of earlier outcomes; None takes that of these.
-        action_dim: Dimension of earlier actions; None takes that of these.
-        exclude_invalid: Drop rows in which a number is missing.
-        may_be_invalid: Whether it is plausible that no row has a measurement, as under
-            a belief from trials that had none.
-
-    Raises:
-        ValueError: If shapes do not fit, theta leaves the support, or no row is valid.
-    """
-    theta = torch.as_tensor(theta, dtype=torch.float32).clone()
-    x = torch.as_tensor(x)
-    x = x[:, None] if x.ndim == 1 else x
-    dim = parameter_dim(prior)
-    require(
-        theta.ndim == 2 and theta.shape[1] == dim and len(x) == len(theta),
-        f"theta (n, {dim}) and x (n, ...) with as many rows",
-        f"{tuple(theta.shape)} and {tuple(x.shape)}",
-        "give one row a simulation",
-    )
-    outside = ~within_support(prior, theta)
-    if bool(outside.any()):
-        row = int(outside.nonzero()[0])
-        raise ValueError(
-            f"expected theta within the prior's support; got {int(outside.sum())} of "
-            f"{len(theta)} rows outside, the first {theta[row].tolist()} in row {row}; "
-            "sample theta from the belief"
-        )
-    x = outcome_rows(x, x.shape[1:] if x_shape is None else x_shape, copy=False)
-    action = action_rows(action, action_dim, num_rows=len(theta))
-    rows = Simulations(theta, action, x)
-    present = finite(x.flatten(1))
-    invalid = ~(present.all(-1) if exclude_invalid else present.any(-1))
-    if bool(invalid.all()) and (exclude_invalid or not may_be_invalid):
-        raise UnexplainedOutcomeError(
-            f"expected at least one simulation with a measurement; got {len(x)} of "
-            f"{len(x)} invalid (NaN or inf); check the simulator at theta = "
-            f"{theta[0].tolist()}, action = {action[0].tolist()}"
-        )
-    if not (exclude_invalid and bool(invalid.any())):
-        return rows
-    warn(
-        f"SA302 dropping {int(invalid.sum())} of {len(x)} simulations without a "
-        "measurement: information gain is then biased towards actions that fail. The "
-        "default MixtureDensity network keeps them.",
-        stacklevel=4,
-    )
-    return rows.at(~invalid)
 
 
 def require_whole(x: Tensor) -> None:
@@ -142,23 +70,19 @@ def check_proposal(proposal: Any, belief: Distribution | None) -> None:
     )
 
 
-def warn_missing(
-    num_missing: int, num_simulations: int, left_out: str, *, stacklevel: int
-) -> None:
+def warn_missing(num_missing: int, num_simulations: int, left_out: str) -> None:
     """Warn that faults of a simulator took some of a refinement's simulations.
 
     Args:
         num_missing: Number of those.
         num_simulations: Number of all.
         left_out: What was left out, as the end of a sentence.
-        stacklevel: Stack level of the warning where it is raised.
     """
     if num_missing:
         warn(
             f"SA301 {num_missing} of {num_simulations} simulations of the refinement "
             f"are missing, by faults of the simulator; {left_out} were left out",
             MissingRowsWarning,
-            stacklevel=stacklevel + 1,
         )
 
 

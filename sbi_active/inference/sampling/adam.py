@@ -10,41 +10,31 @@ from torch.optim.adam import adam
 
 
 class Adam:
-    """Adam, with decoupled weight decay.
+    """Adam, a kernel for all of a parameter's moments.
 
-    It is ``torch.optim.Adam`` to the last bit, or ``AdamW``. Those import torch's
-    compiler at their first step, which takes three CPU seconds of a process.
+    It is ``torch.optim.Adam(fused=True)`` to the last bit. That imports torch's
+    compiler at its first step, which takes three CPU seconds of a process.
 
     Args:
         parameters: Parameters that are changed in place.
         rate: Learning rate.
-        decay: Weight decay, as a share of the learning rate.
-        fused: Whether one kernel updates all of a parameter's moments.
 
     Attributes:
         initial_rate: Learning rate that it began with.
         rate: Learning rate of the next step.
 
     References:
-        Kingma & Ba, ICLR 2015; Loshchilov & Hutter, ICLR 2019.
+        Kingma & Ba, ICLR 2015.
     """
 
-    def __init__(
-        self,
-        parameters: Iterable[Tensor],
-        *,
-        rate: float,
-        decay: float = 0.0,
-        fused: bool = False,
-    ) -> None:
+    def __init__(self, parameters: Iterable[Tensor], *, rate: float) -> None:
         self.parameters = [*parameters]
         self.initial_rate = self.rate = rate
-        self.decay, self.fused = decay, fused
         self._mean = [torch.zeros_like(p) for p in self.parameters]
         self._square = [torch.zeros_like(p) for p in self.parameters]
-        # Counts of one kernel are where it runs, and in single precision.
+        # Counts are where the kernel runs, and in single precision.
         self._steps = [
-            torch.zeros((), dtype=torch.float32, device=p.device if fused else "cpu")
+            torch.zeros((), dtype=torch.float32, device=p.device)
             for p in self.parameters
         ]
 
@@ -57,9 +47,6 @@ class Adam:
     def step(self) -> None:
         """Change the parameters by their gradients."""
         moved = [k for k, p in enumerate(self.parameters) if p.grad is not None]
-        if self.decay:
-            for k in moved:
-                self.parameters[k].mul_(1 - self.rate * self.decay)
         adam(
             [self.parameters[k] for k in moved],
             [g for p in self.parameters if (g := p.grad) is not None],
@@ -67,7 +54,7 @@ class Adam:
             [self._square[k] for k in moved],
             [],
             [self._steps[k] for k in moved],
-            fused=self.fused or None,  # None takes what is fast on the device
+            fused=True,
             amsgrad=False,
             beta1=0.9,
             beta2=0.999,

@@ -2,60 +2,35 @@
 
 from __future__ import annotations
 
-import inspect
 import warnings
 from abc import abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from contextlib import nullcontext
-from typing import Any, ClassVar, TypeVar
+from typing import Any, ClassVar
 
 import cloudpickle
 import torch
-from sbi.inference.trainers._contracts import StartIndexContext
+from sbi.inference.trainers._contracts import (
+    LossArgs,
+    StartIndexContext,
+    TrainConfig,
+)
 from sbi.sbi_types import Tracker
 from sbi.utils.sbiutils import mask_sims_from_prior
 from torch import Tensor
 from torch.distributions import Distribution
+from torch.utils.data import DataLoader
 from typing_extensions import Self
 
 from sbi_active.expected import require
+from sbi_active.inference.networks.mixture_density import MixtureDensity, train_network
 from sbi_active.inference.rounds.condition import pack
-from sbi_active.inference.rounds.rows import check_proposal
+from sbi_active.inference.rounds.rows import check_proposal, require_whole
+from sbi_active.inference.sampling.adam import Adam
 from sbi_active.inference.trainers.base import ActiveInference
+from sbi_active.inference.trainers.signatures import extended, given_arguments
 from sbi_active.simulation.outcomes import Simulations
 from sbi_active.threads import single_thread
-
-Ours = TypeVar("Ours", bound=Callable[..., Any])
-#: Number of epochs that sbi's own default allows.
-NEVER = 2**31 - 1
-
-
-def extends(theirs: Callable[..., Any]) -> Callable[[Ours], Ours]:
-    """Give a method the signature of sbi's, with keywords of its own after that."""
-
-    def decorate(ours: Ours) -> Ours:
-        further = inspect.signature(ours).parameters.values()
-        own = [p for p in further if p.kind is inspect.Parameter.KEYWORD_ONLY]
-        known = inspect.signature(theirs).parameters.values()
-        ours.__signature__ = inspect.Signature([*known, *own])  # pyright: ignore
-        return ours
-
-    return decorate
-
-
-def given_arguments(
-    method: Callable[..., Any], args: tuple[Any, ...], kwargs: Mapping[str, Any]
-) -> dict[str, Any]:
-    """Return by name the arguments that a call of a method of sbi's was given.
-
-    None stands for sbi's default, but as ``clip_max_norm``, where it says not to clip.
-    """
-    given = inspect.signature(method).bind(*args, **kwargs).arguments
-    return {
-        name: value
-        for name, value in given.items()
-        if value is not None or name == "clip_max_norm"
-    }
 
 
 class SilentTracker:
@@ -75,7 +50,9 @@ class ActionRounds(ActiveInference):
     It is mixed in before a trainer of sbi's, whose private hooks it overrides
     (``tests/inference/trainers/test_active.py`` lists them). Without actions that
     trainer does what it always does. A round with them is that of Algorithm 1: this
-    round's rows, a network built anew, plain maximum likelihood.
+    round's rows, a network built anew, plain maximum likelihood. This library's
+    networks are trained by :func:`.train_network`: sbi's loop takes several times as
+    long on networks this small.
 
     Args:
         args: Arguments of sbi's trainer. Rounds with actions need a prior with a
@@ -89,14 +66,29 @@ class ActionRounds(ActiveInference):
     """
 
     #: This library's settings, the default where actions are given.
-    _settings: ClassVar[type]
+    _settings: ClassVar[type] = MixtureDensity
     #: sbi's name of the estimator.
-    _sbi_name: ClassVar[str]
+    _sbi_name: ClassVar[str] = "density_estimator"
+    #: Whether outcomes may be measured in part.
+    _takes_partial: ClassVar[bool] = False
 
     # Attributes of sbi's trainers.
     _device: str
     _round: int
     _neural_net: Any
+    _action_estimator: Any
+    train_indices: Tensor
+    val_indices: Tensor
+
+    def __init_subclass__(cls, **kwargs: Any) -> None:
+        """Give public methods the signatures of the trainer of sbi's beside this."""
+        super().__init_subclass__(**kwargs)
+        theirs: Any = cls.__bases__[-1]
+        if not issubclass(theirs, ActiveInference):
+            for name in ("__init__", "append_simulations", "train"):
+                made = extended(getattr(cls, name), getattr(theirs, name))
+                setattr(cls, name, made)
+
     _theta_roundwise: list[Tensor]
     _x_roundwise: list[Tensor]
     _prior_masks: list[Tensor]
@@ -142,10 +134,6 @@ class ActionRounds(ActiveInference):
     def _network(self, theta: Tensor, x: Tensor) -> Any:
         """Return this library's network for rows as sbi's trainer sees them."""
 
-    @abstractmethod
-    def _training_defaults(self, given: dict[str, Any]) -> dict[str, Any]:
-        """Return arguments of sbi's ``train`` by the settings, before those given."""
-
     def _stored(self, rows: Simulations) -> tuple[Tensor, Tensor]:
         """Return the parameters and outcomes that sbi's trainer sees."""
         return rows.theta, pack(rows.x, rows.action)
@@ -174,7 +162,7 @@ class ActionRounds(ActiveInference):
             "rows appended since",
             "train() without resume_training",
         )
-        defaults = self._training_defaults(given) if self._has_settings else {}
+        defaults = self._action_estimator.training if self._has_settings else {}
         arguments = {**defaults, **given, "retrain_from_scratch": not resume}
         with single_thread() if self._has_settings else nullcontext():
             network = self._train_round(**arguments)
@@ -184,6 +172,62 @@ class ActionRounds(ActiveInference):
     def _train_round(self, **arguments: Any) -> Any:
         """Train on a round with actions."""
         return self._sbi.train(**arguments)
+
+    def _run_training_loop(
+        self,
+        train_loader: DataLoader,
+        val_loader: DataLoader,
+        train_config: TrainConfig,
+        loss_args: LossArgs | None = None,
+        summarization_kwargs: dict[str, Any] | None = None,
+    ) -> Any:
+        """Train; this library's networks with actions, by the lean loop."""
+        trainer: Any = self
+        config = train_config
+        if not (self.has_actions and self._has_settings):
+            return self._sbi._run_training_loop(
+                train_loader, val_loader, config, loss_args, summarization_kwargs
+            )
+        settings, network = self._action_estimator, self._neural_net.to(self._device)
+        if not config.resume_training:  # else the optimizer is the one so far
+            self.optimizer = Adam(network.parameters(), rate=config.learning_rate)
+        train_rows, held_out = self.train_indices, self.val_indices
+        steps = max(len(train_rows) // config.training_batch_size, 1)
+        row_loss, rows = self._prepared(network, loss_args)
+        record = train_network(
+            *(network, self.optimizer, row_loss, rows),
+            train_rows=train_rows,
+            held_out_rows=held_out,
+            num_iterations=min(settings.num_iterations, steps * config.max_num_epochs),
+            batch_size=config.training_batch_size,
+            clip_max_norm=config.clip_max_norm,
+            anneal=settings.anneal,
+            patience=config.stop_after_epochs,
+        )
+        self._judge(network, *(part[held_out] for part in rows))
+        # What sbi's own loop would write.
+        trainer._best_val_loss = best = min(record.validation_loss)
+        summary = trainer._summary
+        summary["training_loss"] += record.training_loss
+        summary["validation_loss"] += record.validation_loss
+        summary["epoch_durations_sec"] += record.seconds
+        summary["epochs_trained"].append(len(record.seconds))
+        summary["best_validation_loss"].append(best)
+        trainer._summarize(round_=self._round)
+        if config.show_train_summary:
+            print(trainer._describe_round(self._round, summary))
+        return network
+
+    def _prepared(
+        self, network: Any, loss_args: LossArgs | None
+    ) -> tuple[Callable[..., Tensor], tuple[Tensor, Tensor]]:
+        """Return a loss, and this round's rows as it takes them, on the device."""
+        theta, x, _ = self.get_simulations()
+        rows = network.prepare(theta.to(self._device), x.to(self._device))
+        return network.prepared_loss, rows
+
+    def _judge(self, network: Any, *held_out: Tensor) -> None:
+        """Settle what held-out rows decide of a trained network."""
 
     def _initialize_neural_network(
         self, retrain_from_scratch: bool, start_idx: int
@@ -250,23 +294,53 @@ class ActionRounds(ActiveInference):
         )
         return False
 
-    def _append_round(
+    def append_simulations(
         self,
-        theta: Tensor,
-        x: Tensor,
-        action: Tensor,
-        belief: Distribution | None,
-        exclude_invalid_x: bool | None,
-        data_device: str | None,
-        proposal: Any = None,
+        *args: Any,
+        action: Tensor | None = None,
+        belief: Distribution | None = None,
+        **kwargs: Any,
     ) -> Self:
-        check_proposal(proposal, self.belief if belief is None else belief)
-        if exclude_invalid_x is None:
-            exclude_invalid_x = not self._has_settings
+        r"""Store simulations for training, with the arguments of sbi's own method.
+
+        Without ``action`` it is sbi's method. With it, the rows belong to the round of
+        ``belief``; the same belief appended again continues that round.
+
+        Args:
+            args: Parameters theta, shape (n, theta_dim), drawn from the belief;
+                outcomes x, shape (n, *x_shape), NaN where there was no measurement; and
+                what else sbi's method takes. With actions, a ``proposal`` is the belief
+                itself or sbi's ``RestrictedPrior`` of it. ``exclude_invalid_x`` says
+                whether to drop rows with NaN: by default they are kept for this
+                library's networks, as information, and dropped for sbi's, which cannot
+                take them, with a warning. Information gain is biased towards actions
+                that fail where they are dropped, since what failures tell about theta
+                is lost and what is left is all success.
+            action: Actions, shape (n, action_dim), or (action_dim,) for all rows.
+            belief: The distribution of theta in this round; None is the current one.
+            kwargs: The same by name.
+
+        Returns:
+            The trainer, so that calls chain.
+
+        Raises:
+            ValueError: If rounds with and without action mix, shapes do not fit, theta
+                leaves the prior's support, or no row is valid; if a likelihood or ratio
+                would be learned of outcomes that are observed in part.
+        """
+        given = given_arguments(self._sbi.append_simulations, args, kwargs)
+        if not self._is_round(action, belief):
+            return self._sbi.append_simulations(**given)
+        assert action is not None
+        check_proposal(given.get("proposal"), self.belief if belief is None else belief)
+        exclude_invalid_x = given.get("exclude_invalid_x", not self._has_settings)
+        theta, x = given["theta"], given["x"]
+        if not (exclude_invalid_x or self._takes_partial):
+            require_whole(x)
+        device = given.get("data_device", self._device)
         own = theta, x, action, belief
         rows, is_new = self._new_rows(*own, exclude_invalid=exclude_invalid_x)
         current = max(self._data_round_index, default=-1)
-        device = self._device if data_device is None else data_device
         if is_new:
             current += 1
             # Nothing is trained on earlier rounds, which may be gigabytes.
@@ -278,6 +352,7 @@ class ActionRounds(ActiveInference):
             outcomes = torch.cat([seen, outcomes])
         self._trained_round = None
         self._theta_roundwise, self._x_roundwise = [parameters], [outcomes]
+        self._proposal_roundwise = [None]  # which sbi's posterior estimators have
         self._prior_masks = [mask_sims_from_prior(current, len(parameters))]
         self._data_round_index = [current]
         return self

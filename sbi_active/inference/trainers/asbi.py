@@ -3,44 +3,33 @@
 from __future__ import annotations
 
 import warnings
-from contextlib import nullcontext
+from collections.abc import Sequence
 from copy import deepcopy
 from dataclasses import replace
 from inspect import signature
 from typing import Any
 
-import torch
 from sbi.inference import NPE_C
-from sbi.inference.trainers._contracts import TrainConfig
 from sbi.inference.trainers.npe.npe_base import PosteriorEstimatorTrainer
 from sbi.neural_nets.estimators.base import ConditionalDensityEstimator
 from torch import Tensor
 from torch.distributions import Distribution
-from typing_extensions import Self
 
 from sbi_active.expected import require
-from sbi_active.inference.beliefs.belief import (
-    Belief,
-    ChainedBelief,
-    UnchangedBelief,
-    compare,
-)
+from sbi_active.inference.beliefs.belief import Belief, ChainedBelief, UnchangedBelief
 from sbi_active.inference.beliefs.priors import require_support
-from sbi_active.inference.engine.learned import LearnedBelief
+from sbi_active.inference.declared.settings import RefinementOptions
 from sbi_active.inference.models.posterior import ActionPosterior
-from sbi_active.inference.networks.mixture_density import TrainingRecord
 from sbi_active.inference.networks.mixture_network import MixtureDensityNetwork
-from sbi_active.inference.refinement.refining import refine
 from sbi_active.inference.rounds.condition import pack
 from sbi_active.inference.rounds.rows import Observation
-from sbi_active.inference.trainers.action_rounds import extends
-from sbi_active.inference.trainers.base import Told, is_finite_somewhere
-from sbi_active.inference.trainers.mixture_rounds import MixtureRounds
+from sbi_active.inference.trainers.action_rounds import ActionRounds
+from sbi_active.inference.trainers.base import is_finite_somewhere
 from sbi_active.messages import warn
 from sbi_active.seeding import kept_generators
 
 
-class ASBI(MixtureRounds, NPE_C):
+class ASBI(ActionRounds, NPE_C):
     r"""Active simulation-based inference, Algorithm 1 of Kim & Matsubara (2025).
 
     Without ``action=`` it is sbi's :class:`~sbi.inference.NPE_C`, to the last bit at
@@ -54,6 +43,10 @@ class ASBI(MixtureRounds, NPE_C):
 
     ``build_posterior`` then gives an :class:`.ActionPosterior`, whose prior is the
     belief of the round unless another is passed.
+
+    ``train`` then refuses ``num_atoms``, ``discard_prior_samples`` and
+    ``use_combined_loss``, which have no meaning in such a round, and
+    ``calibration_kernel`` for :class:`MixtureDensity`.
 
     ``update`` without a simulator is Step 3 of the paper, the network's value at the
     trial: :math:`b(\theta) = q(\theta | x_o, \xi^*)` within the prior's support, a
@@ -95,79 +88,12 @@ class ASBI(MixtureRounds, NPE_C):
         torch.Size([3, 1])
     """
 
-    _fused = True
-
-    @extends(NPE_C.__init__)
-    def __init__(self, *args: Any, **kwargs: Any) -> None:
-        super().__init__(*args, **kwargs)
-
-    def append_simulations(
-        self,
-        theta: Tensor,
-        x: Tensor,
-        proposal: Any = None,
-        exclude_invalid_x: bool | None = None,
-        data_device: str | None = None,
-        *,
-        action: Tensor | None = None,
-        belief: Distribution | None = None,
-    ) -> Self:
-        r"""Store simulations for training.
-
-        Without ``action`` this is sbi's method. With it, the rows belong to the round
-        of ``belief``; the same belief appended again continues that round.
-
-        Args:
-            theta: Parameters, shape (n, theta_dim), drawn from the belief.
-            x: Outcomes, shape (n, *x_shape); NaN where there was no measurement.
-            proposal: Proposal, without actions as in sbi. With them, None, the belief
-                itself or sbi's ``RestrictedPrior`` of it.
-            exclude_invalid_x: Whether to drop rows with NaN. With actions, None keeps
-                them with NaN as information for :class:`MixtureDensity`, and drops them
-                for sbi's networks, which cannot take them, with a warning. True drops
-                them: information gain is then biased towards actions that fail, since
-                what failures tell about theta is lost and what is left is all success.
-            data_device: Device that keeps the rows.
-            action: Actions, shape (n, action_dim), or (action_dim,) for all rows.
-            belief: The distribution of theta in this round; None is the current one.
-
-        Returns:
-            The trainer, so that calls chain.
-
-        Raises:
-            ValueError: If rounds with and without action mix, shapes do not fit, theta
-                leaves the prior's support, or no row is valid.
-        """
-        if not self._is_round(action, belief):
-            return super().append_simulations(
-                theta, x, proposal, exclude_invalid_x, data_device
-            )
-        assert action is not None
-        self._append_round(
-            theta, x, action, belief, exclude_invalid_x, data_device, proposal
-        )
-        self._proposal_roundwise.append(None)
-        return self
-
-    @extends(NPE_C.train)
-    def train(self, *args: Any, **kwargs: Any) -> Any:
-        """Train the density estimator, see :meth:`.ActionRounds.train`.
-
-        Raises:
-            ValueError: If with actions ``num_atoms``, ``discard_prior_samples`` or
-                ``use_combined_loss`` are given, which have no meaning there, or
-                ``calibration_kernel`` for :class:`MixtureDensity`.
-        """
-        return super().train(*args, **kwargs)
+    _takes_partial = True
 
     def _train_round(self, **arguments: Any) -> ConditionalDensityEstimator:
         others = ["calibration_kernel"] if self._has_settings else []
-        for name in (
-            "discard_prior_samples",
-            "use_combined_loss",
-            "num_atoms",
-            *others,
-        ):
+        refused = ("discard_prior_samples", "use_combined_loss", "num_atoms", *others)
+        for name in refused:
             default = signature(NPE_C.train).parameters[name].default
             value = arguments.pop(name, default)
             require(
@@ -186,13 +112,6 @@ class ASBI(MixtureRounds, NPE_C):
     def _network(self, theta: Tensor, x: Tensor) -> MixtureDensityNetwork:
         # It does better where it knows which numbers are the action.
         return self._action_estimator.build(theta, x, self._action_dim)
-
-    def _train_mixture(self, config: TrainConfig) -> TrainingRecord:
-        return self._trained(
-            *(self._neural_net, config, *self._round_rows()),
-            train_rows=self.train_indices,
-            held_out_rows=self.val_indices,
-        )
 
     def _resolve_prior(self, prior: Any, sample_with: Any) -> Any:
         """Return the prior of a posterior: the belief of this round; sbi's hook."""
@@ -217,41 +136,20 @@ class ASBI(MixtureRounds, NPE_C):
         assert self._outcome_shape is not None
         return ActionPosterior(packed, self._outcome_shape, self._action_dim)
 
-    def _infer(self, told: Told) -> Belief:
-        trials, chained = told.trials, None
-        if self._may_ask_network(told):
-            with nullcontext() if told.given_seed is None else kept_generators():
-                required = told.simulator is None
-                chained = self._chained(trials[-1], required=required)
-        if told.simulator is None:
-            assert chained is not None
-            return chained
-        previous = None if told.afresh else self._belief
-        # A chained belief can be wrong; the refined one before the trial holds the
-        # posterior, if only it is wide enough.
-        start = [] if chained is None else [chained]
-        if isinstance(previous, LearnedBelief):
-            start.append(previous)
-        belief = refine(
-            told.simulator,
-            require_support(self._prior, enumerates=True),
-            torch.stack([t.action for t in trials]),
-            torch.stack([t.x for t in trials]),
-            start=start,
-            past=getattr(previous, "histories", None),
-            settings=told.settings,
-            seed=told.seed(),
-        )
-        if isinstance(chained, ChainedBelief):
-            compare(belief, chained)
-        return belief
-
-    def _chained(self, trial: Observation, *, required: bool) -> Belief | None:
-        """Return the network's value at the trial.
+    def _learned(
+        self,
+        trials: Sequence[Observation],
+        settings: RefinementOptions,
+        seed: int | None,
+        *,
+        required: bool,
+    ) -> Belief | None:
+        """Return the network's value at the last trial.
 
         It is None if there is no network, or it has never seen such an outcome; if
         a belief is required, the first is an error and the second the belief before.
         """
+        trial = trials[-1]
         network, previous = self._neural_net, self.belief
         if required:
             self._require_trained()
@@ -267,8 +165,7 @@ class ASBI(MixtureRounds, NPE_C):
                 f"{fault[0]} the network has never seen an outcome like "
                 f"{trial.x.tolist()}: {fault[1]}, so the belief is left unchanged. "
                 "Refine with the simulator, simulate such outcomes as NaN, or leave "
-                "the trial out where a fault caused them.",
-                stacklevel=5,
+                "the trial out where a fault caused them."
             )
             unchanged = UnchangedBelief(prior, previous)
             unchanged.diagnostics = unchanged.diagnostics.warned(" ".join(fault))

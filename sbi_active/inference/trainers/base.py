@@ -4,47 +4,31 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from contextlib import nullcontext
 from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
 from torch.distributions import Distribution
 
+from sbi_active.arrays import finite
 from sbi_active.expected import require
-from sbi_active.inference.beliefs.belief import Belief, named
+from sbi_active.inference.beliefs.belief import (
+    Belief,
+    ChainedBelief,
+    compare,
+    named,
+)
 from sbi_active.inference.beliefs.priors import require_support
 from sbi_active.inference.declared.settings import RefinementOptions
+from sbi_active.inference.engine.learned import LearnedBelief
+from sbi_active.inference.refinement.refining import refine
 from sbi_active.inference.rounds.condition import action_rows, outcome_rows
-from sbi_active.inference.rounds.rows import Observation, round_rows
-from sbi_active.seeding import forked_generators
+from sbi_active.inference.rounds.rows import Observation, UnexplainedOutcomeError
+from sbi_active.messages import warn
+from sbi_active.seeding import forked_generators, kept_generators
 from sbi_active.simulation.outcomes import Simulations
-
-
-@dataclass(frozen=True)
-class Told:
-    """Trials and options from which a belief is inferred.
-
-    Attributes:
-        trials: Trials, all of them, the new one last.
-        simulator: If given, simulator to refine the belief with; otherwise use the
-            network.
-        settings: Settings of the refinement.
-        given_seed: Seed given by the caller; None for none.
-        afresh: Whether to begin at the prior, without the belief before the last trial
-            and without this round's network.
-    """
-
-    trials: Sequence[Observation]
-    simulator: Callable[..., Any] | None
-    settings: RefinementOptions
-    given_seed: int | None
-    afresh: bool = False
-
-    def seed(self) -> int:
-        """Return the seed given, or else one from torch's global generator."""
-        given = self.given_seed
-        return int(torch.randint(2**62, ())) if given is None else given
+from sbi_active.support import parameter_dim, within_support
 
 
 def is_finite_somewhere(
@@ -71,8 +55,10 @@ class ActiveInference(ABC):
     model has ``log_posterior``, ``log_likelihood`` or ``log_ratio``, which is all that
     a designer asks for.
 
-    A method implements these three and :meth:`_infer`, the one step in which methods
-    differ once a trial is told.
+    A method implements these three and :meth:`_learned`, the belief by its network
+    alone. With a simulator the belief of every method is "refined": the posterior of
+    all trials so far given the original prior, from simulations where it is plausible
+    (:func:`.refine`).
 
     Attributes:
         trials: Real trials so far, in order.
@@ -146,10 +132,8 @@ class ActiveInference(ABC):
                 belief last changed.
             ValueError: If shapes do not fit.
         """
-        trial = self._observation(x_o, action)
-        trials = (*self.trials, trial)
-        settings = refinement or RefinementOptions()
-        return self._conclude(Told(trials, simulator, settings, seed))
+        trials = (*self.trials, self._observation(x_o, action))
+        return self._conclude(trials, simulator, refinement, seed)
 
     def update_all(
         self,
@@ -171,8 +155,7 @@ class ActiveInference(ABC):
             ValueError: If there is no trial.
         """
         require(len(trials) > 0, "at least one trial", "none", "pass trials")
-        settings = refinement or RefinementOptions()
-        return self._conclude(Told((*trials,), simulator, settings, seed, True))
+        return self._conclude(trials, simulator, refinement, seed, afresh=True)
 
     def resume(self, belief: Distribution, trials: Sequence[Observation]) -> None:
         """Go on from a belief that was inferred before.
@@ -185,20 +168,76 @@ class ActiveInference(ABC):
         self._forget_round()
 
     @abstractmethod
-    def _infer(self, told: Told) -> Belief:
-        """Return the belief after trials, and change nothing."""
+    def _learned(
+        self,
+        trials: Sequence[Observation],
+        settings: RefinementOptions,
+        seed: int | None,
+        *,
+        required: bool,
+    ) -> Belief | None:
+        """Return the belief by what this round learned, and change nothing.
 
-    def _conclude(self, told: Told) -> Belief:
-        """End the round with a belief: its network belongs to the one before."""
-        self._belief = belief = self._infer(told)
-        named(belief, told.simulator)
-        self.trials = [*told.trials]
-        self._forget_round()
+        It is None if nothing was learned and no belief is required, or where a
+        refinement would not begin there.
+        """
+
+    def _inferred(
+        self,
+        trials: Sequence[Observation],
+        simulator: Callable[..., Any] | None,
+        settings: RefinementOptions,
+        seed: int | None,
+        *,
+        afresh: bool,
+    ) -> Belief:
+        """Return the belief after trials, and change nothing.
+
+        Afresh it begins at the prior, without the belief before and the network.
+        """
+        learned, required = None, simulator is None
+        if required or (self.starts_at_network and not afresh):
+            with nullcontext() if seed is None else kept_generators():
+                learned = self._learned(trials, settings, seed, required=required)
+        if simulator is None:
+            assert learned is not None
+            return learned
+        previous = None if afresh else self._belief
+        # A belief of a network can be wrong; the refined one before the trial holds the
+        # posterior, if only it is wide enough.
+        start = [] if learned is None else [learned]
+        if isinstance(previous, LearnedBelief):
+            start.append(previous)
+        belief = refine(
+            simulator,
+            require_support(self._prior, enumerates=True),
+            torch.stack([t.action for t in trials]),
+            torch.stack([t.x for t in trials]),
+            start=start,
+            past=getattr(previous, "histories", None),
+            settings=settings,
+            seed=int(torch.randint(2**62, ())) if seed is None else seed,
+        )
+        if isinstance(learned, ChainedBelief):
+            compare(belief, learned)
         return belief
 
-    def _may_ask_network(self, told: Told) -> bool:
-        """Return whether the belief may use this round's network, if there is one."""
-        return told.simulator is None or (self.starts_at_network and not told.afresh)
+    def _conclude(
+        self,
+        trials: Sequence[Observation],
+        simulator: Callable[..., Any] | None,
+        refinement: RefinementOptions | None,
+        seed: int | None,
+        *,
+        afresh: bool = False,
+    ) -> Belief:
+        """End the round with a belief: its network belongs to the one before."""
+        settings = refinement or RefinementOptions()
+        belief = self._inferred(trials, simulator, settings, seed, afresh=afresh)
+        named(belief, simulator)
+        self._belief, self.trials = belief, [*trials]
+        self._forget_round()
+        return belief
 
     @abstractmethod
     def _forget_round(self) -> None:
@@ -213,17 +252,48 @@ class ActiveInference(ABC):
         *,
         exclude_invalid: bool,
     ) -> tuple[Simulations, bool]:
-        """Return checked rows of a belief, and whether they begin another round."""
-        rows = round_rows(
-            theta,
-            x,
-            action,
-            prior=require_support(self._prior),
-            x_shape=self._outcome_shape,
-            action_dim=self._action_dim,
-            exclude_invalid=exclude_invalid,
-            may_be_invalid=bool(self.trials),
+        """Return checked rows of a belief in float32, and whether a round begins.
+
+        Outcomes may be gigabytes: who keeps them makes a copy. That no row has a
+        measurement is plausible under a belief from trials that had none.
+        """
+        prior = require_support(self._prior)
+        theta = torch.as_tensor(theta, dtype=torch.float32).clone()
+        x = torch.as_tensor(x)
+        x = x[:, None] if x.ndim == 1 else x
+        dim = parameter_dim(prior)
+        require(
+            theta.ndim == 2 and theta.shape[1] == dim and len(x) == len(theta),
+            f"theta (n, {dim}) and x (n, ...) with as many rows",
+            f"{tuple(theta.shape)} and {tuple(x.shape)}",
+            "give one row a simulation",
         )
+        outside = ~within_support(prior, theta)
+        if bool(outside.any()):
+            row = int(outside.nonzero()[0])
+            raise ValueError(
+                "expected theta within the prior's support; got "
+                f"{int(outside.sum())} of {len(theta)} rows outside, the first "
+                f"{theta[row].tolist()} in row {row}; sample theta from the belief"
+            )
+        x = outcome_rows(x, self._outcome_shape or x.shape[1:], copy=False)
+        action = action_rows(action, self._action_dim, num_rows=len(theta))
+        rows = Simulations(theta, action, x)
+        present = finite(x.flatten(1))
+        invalid = ~(present.all(-1) if exclude_invalid else present.any(-1))
+        if bool(invalid.all()) and (exclude_invalid or not self.trials):
+            raise UnexplainedOutcomeError(
+                f"expected at least one simulation with a measurement; got {len(x)} of "
+                f"{len(x)} invalid (NaN or inf); check the simulator at theta = "
+                f"{theta[0].tolist()}, action = {action[0].tolist()}"
+            )
+        if exclude_invalid and bool(invalid.any()):
+            warn(
+                f"SA302 dropping {int(invalid.sum())} of {len(x)} simulations without "
+                "a measurement: information gain is then biased towards actions that "
+                "fail. The default MixtureDensity network keeps them."
+            )
+            rows = rows.at(~invalid)
         self._outcome_shape, self._action_dim = rows.x.shape[1:], rows.action.shape[1]
         belief = self.belief if belief is None else belief
         is_new = belief is not self._round_belief

@@ -2,34 +2,148 @@
 
 from __future__ import annotations
 
-import warnings
-from inspect import signature
-from typing import Any
+from collections.abc import Callable, Sequence
+from copy import deepcopy
+from typing import Any, ClassVar
 
+import numpy as np
 import torch
 from sbi.inference import NLE_A, NRE_C
-from sbi.inference.trainers._contracts import TrainConfig
-from sbi.neural_nets.ratio_estimators import RatioEstimator
 from torch import Tensor
+from torch.distributions import Distribution
 from typing_extensions import Self
 
-from sbi_active.inference.models.factors import ActionLikelihood, ActionRatio
+from sbi_active.expected import require
+from sbi_active.inference.beliefs.belief import Belief
+from sbi_active.inference.beliefs.priors import require_support
+from sbi_active.inference.beliefs.weighted import KernelBelief
+from sbi_active.inference.declared.settings import RefinementOptions
+from sbi_active.inference.models.factors import (
+    ActionFactor,
+    ActionLikelihood,
+    ActionRatio,
+    Product,
+    sample_product,
+    trained_region,
+)
 from sbi_active.inference.models.lfire import LFIRE
 from sbi_active.inference.networks.likelihood_network import LikelihoodNetwork
-from sbi_active.inference.networks.mixture_density import TrainingRecord
 from sbi_active.inference.networks.ratio_network import RatioClassifier, RatioNetwork
-from sbi_active.inference.trainers.action_rounds import extends
-from sbi_active.inference.trainers.mixture_rounds import MixtureRounds
-from sbi_active.inference.trainers.product_rounds import ProductRounds
+from sbi_active.inference.rounds.rows import Observation, require_whole
+from sbi_active.inference.sampling.coordinates import PriorCoordinates
+from sbi_active.inference.trainers.action_rounds import ActionRounds
+from sbi_active.inference.trainers.base import is_finite_somewhere
 from sbi_active.inference.trainers.seqbed import SeqBED_LFIRE
 from sbi_active.messages import ChangedWarning, warn
+from sbi_active.seeding import derive_seed, forked_generators
 from sbi_active.simulation.outcomes import Simulations
 
+SAMPLERS = ("importance", "kde")
 #: Keywords of SeqBED in the last version alone.
 LFIRE_KEYWORDS = {"settings", "num_particles"}
 
 
-class ALHI(ProductRounds, MixtureRounds, NLE_A):
+class ProductRounds(ActionRounds):
+    r"""Rounds of a method that learns a factor of each trial's likelihood.
+
+    The belief is the original prior times the product over the history, in which the
+    latest network gives the factor of every trial, within the region of its training
+    rows:
+
+    .. math::
+        b_r(\theta) \propto p(\theta)\, 1[\theta \in R_r]
+        \prod_{k \le r} q_r(x_k | \theta, \xi_k).
+
+    That is ``update`` without a simulator.
+
+    Args:
+        args: Arguments of :class:`.ActionRounds`.
+        posterior: Sampling method for the belief: "importance", tempered importance
+            sampling; or "kde", the paper's: draws of the belief before times the last
+            trial's factor, as a kernel density estimate.
+        kwargs: Arguments of :class:`.ActionRounds` by name.
+
+    References:
+        Papamakarios, Sterratt & Murray, AISTATS 2019 (likelihoods need no correction
+        for where theta was drawn); Deistler, Goncalves & Macke, NeurIPS 2022 (keeping
+        to where a network was trained).
+    """
+
+    _factor: ClassVar[type[ActionFactor]]
+
+    def __init__(
+        self, *args: Any, posterior: str = "importance", **kwargs: Any
+    ) -> None:
+        known = ", ".join(map(repr, SAMPLERS))
+        advice = f"posterior among {known}", repr(posterior), "choose one of these"
+        require(posterior in SAMPLERS, *advice)
+        super().__init__(*args, **kwargs)
+        self._sampler = posterior
+
+    def _model(self, estimator: Any, *arguments: Any) -> ActionFactor:
+        assert self._outcome_shape is not None
+        assert self._action_dim is not None
+        return self._factor(
+            estimator, self._round_belief, self._outcome_shape, self._action_dim
+        )
+
+    def _learned(
+        self,
+        trials: Sequence[Observation],
+        settings: RefinementOptions,
+        seed: int | None,
+        *,
+        required: bool,
+        num_kernels: int = 2_000,
+        num_hints: int = 1_000,
+    ) -> Belief | None:
+        """Return the product under this round's network, where it is required."""
+        if not required:
+            return None
+        require_whole(torch.stack([trial.x for trial in trials]))
+        self._require_trained()
+        seed = int(torch.randint(2**62, ())) if seed is None else seed
+        prior, previous = require_support(self._prior), self._round_belief
+        rng = np.random.default_rng(derive_seed(seed, "product"))
+        coordinates = PriorCoordinates(prior, rng)
+        region, hint = None, None
+        if previous is not prior:
+            rows = self.get_simulations()[0][:, : coordinates.dim].cpu()
+            region = trained_region(coordinates.to_z(rows), rng)
+            hint = rows[rng.permutation(len(rows))[:num_hints]]
+        is_chained = self._sampler == "kde"
+        learned = self._model(deepcopy(self._neural_net))
+        used = trials[-1:] if is_chained else trials
+        counted = [t for t in used if _says_something(learned, t, prior)]
+        before = previous if is_chained and previous is not prior else None
+        product = Product(coordinates, learned, counted, region, before)
+        belief: Belief = sample_product(product, hint, rng, settings)
+        if is_chained:
+            with forked_generators(seed, "kernels"):
+                belief = KernelBelief(prior, belief.sample(torch.Size([num_kernels])))
+        num_lost = len(used) - len(counted)
+        if num_lost:
+            belief.diagnostics = belief.diagnostics.warned(
+                f"SA113 {num_lost} trials are left out, at which the network's "
+                "density is finite nowhere: a measurement is wrong, or the simulator "
+                "lacks much"
+            )
+        return belief
+
+
+def _says_something(
+    learned: ActionFactor, trial: Observation, prior: Distribution
+) -> bool:
+    """Return whether the factor of a trial is finite anywhere."""
+
+    def log_factor(theta: Tensor) -> Tensor:
+        x = trial.x.expand(len(theta), *trial.x.shape)
+        return learned.log_factor(theta, x, trial.action.expand(len(theta), -1))
+
+    return is_finite_somewhere(prior, log_factor)
+
+
+class ALHI(ProductRounds, NLE_A):
     r"""Active likelihood-based inference, the paper's ALHI; at random actions NLHI.
 
     Without ``action=`` it is sbi's :class:`~sbi.inference.NLE_A`, to the last bit at
@@ -79,41 +193,15 @@ class ALHI(ProductRounds, MixtureRounds, NLE_A):
 
     _factor = ActionLikelihood
 
-    @extends(NLE_A.__init__)
-    def __init__(
-        self, *args: Any, posterior: str = "importance", **kwargs: Any
-    ) -> None:
-        super().__init__(*args, posterior=posterior, **kwargs)
-
     def _stored(self, rows: Simulations) -> tuple[Tensor, Tensor]:
         return torch.cat([rows.theta, rows.action], 1), rows.x.flatten(1).clone()
-
-    @extends(NLE_A.train)
-    def train(self, *args: Any, **kwargs: Any) -> Any:
-        """Train the density estimator, see :meth:`.ActionRounds.train`."""
-        return super().train(*args, **kwargs)
 
     def _network(self, theta: Tensor, x: Tensor) -> LikelihoodNetwork:
         assert self._action_dim is not None
         return LikelihoodNetwork(self._action_estimator, x, theta, self._action_dim)
 
-    def _train_mixture(self, config: TrainConfig) -> TrainingRecord:
-        network = self._neural_net
-        condition, x = self._round_rows()
-        rows = [
-            network.residual_rows(x[index], condition[index])
-            for index in (self.train_indices, self.val_indices)
-        ]
-        residual, seen = (torch.cat(parts) for parts in zip(*rows, strict=True))
-        order, num_train = torch.arange(len(residual)), len(rows[0][0])
-        record = self._trained(
-            *(network.mixture, config, residual, seen),
-            train_rows=order[:num_train],
-            held_out_rows=order[num_train:],
-        )
-        network.choose(*rows[1])
-        network.eval()
-        return record
+    def _judge(self, network: Any, *held_out: Tensor) -> None:
+        network.choose(*held_out)
 
 
 class SeqBED(ProductRounds, NRE_C):
@@ -166,42 +254,17 @@ class SeqBED(ProductRounds, NRE_C):
     _factor = ActionRatio
     _settings = RatioClassifier
     _sbi_name = "classifier"
-    _action_estimator: Any
     _is_default: bool
-
-    @extends(NRE_C.__init__)
-    def __init__(
-        self, *args: Any, posterior: str = "importance", **kwargs: Any
-    ) -> None:
-        super().__init__(*args, posterior=posterior, **kwargs)
+    _get_losses: Callable[..., Tensor]
 
     def _network(self, theta: Tensor, x: Tensor) -> RatioNetwork:
         assert self._action_dim is not None
         return RatioNetwork(self._action_estimator, theta, x, self._action_dim)
 
-    def _training_defaults(self, given: dict[str, Any]) -> dict[str, Any]:
-        settings: RatioClassifier = self._action_estimator
-        num_rows = len(self._round_parameters())
-        fraction = signature(NRE_C.train).parameters["validation_fraction"]
-        num_rows -= int(num_rows * given.get(fraction.name, fraction.default))
-        steps = max(num_rows // settings.batch_size, 1)
-        return {
-            "training_batch_size": settings.batch_size,
-            "learning_rate": settings.learning_rate,
-            "max_num_epochs": max(settings.num_iterations // steps, 1),
-            "stop_after_epochs": settings.stop_after_epochs,
-        }
-
-    def _train_round(self, **arguments: Any) -> RatioEstimator:
-        with warnings.catch_warnings():
-            if self._has_settings:  # the number of epochs is one of them
-                warnings.filterwarnings("ignore", message="Maximum number of epochs")
-            return super()._train_round(**arguments)
-
-    def _report_convergence_at_end(self, epoch: int, max_num_epochs: int) -> None:
-        if self.has_actions and not self._show_progress_bars:
-            return  # sbi prints a line
-        super()._report_convergence_at_end(epoch, max_num_epochs)  # pyright: ignore
+    def _prepared(self, network: Any, loss_args: Any) -> Any:
+        theta, x, _ = self.get_simulations()
+        rows = theta.to(self._device), x.to(self._device)
+        return lambda *batch: self._get_losses(batch, loss_args), rows
 
     def __new__(cls, *args: Any, **kwargs: Any) -> Self:
         """Make it, or what the arguments meant in the last version."""
@@ -209,8 +272,7 @@ class SeqBED(ProductRounds, NRE_C):
         if isinstance(classifier, LFIRE) or LFIRE_KEYWORDS & {*kwargs}:
             warn(
                 "SA701 sbi_active.SeqBED of logistic regressions goes in the next "
-                "version: use sbi_active.inference.SeqBED_LFIRE",
-                stacklevel=2,
+                "version: use sbi_active.inference.SeqBED_LFIRE"
             )
             return SeqBED_LFIRE(*args, **kwargs)  # pyright: ignore[reportReturnType]
         made = super().__new__(cls)
@@ -226,11 +288,5 @@ class SeqBED(ProductRounds, NRE_C):
                 "use sbi_active.inference.SeqBED_LFIRE(prior), and for this one pass "
                 "SeqBED(prior, RatioClassifier())",
                 ChangedWarning,
-                stacklevel=2,
             )
         return super().arrange(theta, action)
-
-    @extends(NRE_C.train)
-    def train(self, *args: Any, **kwargs: Any) -> Any:
-        """Train the classifier, see :meth:`.ActionRounds.train`."""
-        return super().train(*args, **kwargs)

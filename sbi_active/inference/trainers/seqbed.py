@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
 
 import torch
 from sbi.sbi_types import Tracker
@@ -16,11 +16,11 @@ from sbi_active.expected import require
 from sbi_active.inference.beliefs.belief import Belief
 from sbi_active.inference.beliefs.priors import require_support
 from sbi_active.inference.beliefs.weighted import KernelBelief
+from sbi_active.inference.declared.settings import RefinementOptions
 from sbi_active.inference.models.lfire import LFIRE, LFIREModel, fit_log_ratios
-from sbi_active.inference.rounds.rows import Observation, require_whole, rows_of
-from sbi_active.inference.trainers.base import ActiveInference, Told
+from sbi_active.inference.rounds.rows import Observation, require_whole
+from sbi_active.inference.trainers.base import ActiveInference
 from sbi_active.messages import warn
-from sbi_active.seeding import derive_seed, forked_generators
 from sbi_active.simulation.outcomes import Simulations
 from sbi_active.threads import single_thread
 
@@ -43,10 +43,8 @@ class SeqBED_LFIRE(ActiveInference):  # noqa: N801 - as NRE_B
     the method is its cost: every particle needs simulations of its own.
     :class:`.SeqBED` shares them.
 
-    With a simulator, ``update`` simulates new particles at the executed action alone,
-    which allows more of them: ``refinement.num_histories`` simulations a trial. The
-    belief is kernels around the weighted particles; its diagnostics tell their
-    effective number.
+    Without a simulator, the belief after ``update`` is kernels around the weighted
+    particles; its diagnostics tell their effective number.
 
     Args:
         prior: The prior over parameters, with a support.
@@ -184,71 +182,44 @@ class SeqBED_LFIRE(ActiveInference):  # noqa: N801 - as NRE_B
     def _forget_round(self) -> None:
         self._model, self._rows = None, []
 
-    def _infer(self, told: Told) -> Belief:
-        trials, seed = told.trials, told.seed()
-        require_whole(torch.stack([trial.x for trial in trials]))
-        if told.simulator is None:
-            return self._weighted(self.build_posterior(), trials[-1], {})
-        beliefs: list[Any] = [self._prior if told.afresh else self.belief]
-        for k, trial in enumerate(trials if told.afresh else trials[-1:]):
-            own = derive_seed(seed, "trial", k) if told.afresh else seed
-            beliefs.append(self._simulated(told, beliefs[-1], trial, own))
-        known = [belief.diagnostics for belief in beliefs[1:]]
-        beliefs[-1].diagnostics = known[-1].extended(
-            num_simulations=sum(d.num_simulations for d in known),
-            num_missing=sum(d.num_missing for d in known),
-        )
-        return beliefs[-1]
-
-    def _simulated(
-        self, told: Told, belief: Distribution, trial: Observation, seed: int
-    ) -> Belief:
-        """Weigh new particles of a belief, simulated at the executed action."""
-        n = told.settings.num_histories
-        with forked_generators(seed, "theta"):
-            drawn = belief.sample(torch.Size([n]))
-        theta, action = self.arrange(drawn, trial.action.expand(n, -1))
-        simulator, workers = told.simulator, told.settings.workers
-        assert simulator is not None
-        rows = rows_of(simulator, theta, action, derive_seed(seed, "x"), workers)
-        assert rows is not None
-        folds = derive_seed(seed, "folds")
-        with single_thread():
-            model = fit_log_ratios(self._settings, [rows.without_missing()], folds)
-        spent = {"num_simulations": len(rows), "num_missing": rows.counts["missing"]}
-        return self._weighted(model, trial, spent)
-
-    def _weighted(
-        self, model: LFIREModel, trial: Observation, spent: dict[str, int]
-    ) -> Belief:
-        particles = model.particles
-        action = model.nearest_action(trial.action)
+    def _learned(
+        self,
+        trials: Sequence[Observation],
+        settings: RefinementOptions,
+        seed: int | None,
+        *,
+        required: bool,
+    ) -> Belief | None:
+        """Return particles weighted by the last trial, where they are required."""
+        if not required:
+            return None
+        trial, model = trials[-1], self.build_posterior()
+        require_whole(trial.x[None])
+        particles, action = model.particles, model.nearest_action(trial.action)
         if not torch.equal(action, trial.action):
             warn(
                 f"SA108 the executed action {trial.action.tolist()} was not "
                 f"simulated; the ratios are those at {action.tolist()}. Pass a "
-                "simulator to update().",
-                stacklevel=5,
+                "simulator to update()."
             )
-        n = len(particles)
+        n, warnings = len(particles), []
         rows = trial.x.expand(n, *trial.x.shape), action.expand(n, -1)
         log_ratio = model.log_ratio(particles, *rows)
-        says_nothing = not bool(log_ratio.isfinite().any())
-        if says_nothing:  # beyond 1e19 float32 has no squares
+        if not bool(log_ratio.isfinite().any()):  # beyond 1e19 float32 has no squares
             log_ratio = torch.zeros_like(log_ratio)
-        weight = log_ratio.nan_to_num(-torch.inf).softmax(0)
-        belief = KernelBelief(self._prior, particles, weight)
-        belief.label = "weighted particles"
-        effective = belief.diagnostics.effective_sample_size or 0.0
-        belief.diagnostics = belief.diagnostics.extended(num_particles=n, **spent)
-        if says_nothing:
-            belief.diagnostics = belief.diagnostics.warned(
+            warnings.append(
                 "SA113 the ratios are finite nowhere at the last trial, which is left "
                 "out: a measurement is wrong, or the simulator lacks much"
             )
+        weight = log_ratio.nan_to_num(-torch.inf).softmax(0)
+        belief = KernelBelief(self._prior, particles, weight)
+        belief.label = "weighted particles"
+        effective = float(1 / weight.square().sum())
         if effective < 0.1 * n:
-            belief.diagnostics = belief.diagnostics.warned(
+            warnings.append(
                 f"SA114 {effective:.1f} of {n} particles are effective: the belief is "
                 "as wide as its kernels"
             )
+        known = belief.diagnostics.extended(num_particles=n)
+        belief.diagnostics = known.warned(*warnings)
         return belief

@@ -14,10 +14,4 @@ if TYPE_CHECKING:
 
 __all__ = ["Bank", "CorruptSegmentError", "LockedError"]
 
-__getattr__ = lazy_names(
-    __name__,
-    {
-        name: f"sbi_active.simulation.reweighting:{name}"
-        for name in ("ReusedRows", "reuse")
-    },
-)
+__getattr__ = lazy_names(__name__)

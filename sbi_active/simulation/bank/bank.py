@@ -243,9 +243,7 @@ class Bank:
             log_proposal = log_density(proposal, rows["theta"])
         if num := int((log_proposal == -torch.inf).sum()):
             text = f"SA305 {num} of {len(log_proposal)} rows have density 0 under the"
-            warn(
-                f"{text} proposal {label!r}: they were not drawn from it", stacklevel=3
-            )
+            warn(f"{text} proposal {label!r}: they were not drawn from it")
         known = {"run": run, "seed": int(seed), "label": label}
         self._write(known, {**columns, "log_proposal": log_proposal})
 

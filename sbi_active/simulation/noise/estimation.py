@@ -119,8 +119,7 @@ def _groups(repeats: Array | Sequence[Array]) -> list[Tensor]:
     if freedom == 1:
         warn(
             "SA212 expected at least 3 repeats to estimate noise; got 2, from which "
-            "the standard deviation is known to a factor of 30; repeat the trial again",
-            stacklevel=3,
+            "the standard deviation is known to a factor of 30; repeat the trial again"
         )
     return [g for g in groups if len(g) > 1]
 

@@ -139,7 +139,6 @@ def simulate(
             f"the first is row {row}: {text.strip().splitlines()[-1]}. All tracebacks "
             "are in Simulations.tracebacks",
             MissingRowsWarning,
-            stacklevel=2,
         )
     return rows
 

@@ -355,8 +355,7 @@ class DaskPool:
             warn(
                 f"SA306 no workers at {self._client.scheduler.address}: "
                 f"{len(self._calls)} calls of the simulator wait for one; start "
-                "workers there, or interrupt, which keeps what is finished",
-                stacklevel=2,
+                "workers there, or interrupt, which keeps what is finished"
             )
         # A LocalCluster gives up each worker that is not back 15 s after its death.
         if hasattr(cluster := self._client.cluster, "worker_spec"):

@@ -24,14 +24,11 @@ from sbi_active.inference.sampling.truncated import log_inside, truncated_normal
 from sbi_active.inference.sampling.weights import systematic
 
 
-@pytest.mark.parametrize("fused", [False, True])
-@pytest.mark.parametrize("decay", [0.0, 1e-2])
-def test_it_is_that_of_torch_to_the_last_bit(fused, decay):
+def test_it_is_that_of_torch_to_the_last_bit():
     ours = torch.nn.Sequential(torch.nn.Linear(5, 3), torch.nn.Linear(4, 2))
     theirs = copy.deepcopy(ours)
-    kind = torch.optim.AdamW if decay else torch.optim.Adam
-    known = kind(theirs.parameters(), lr=0.01, weight_decay=decay, fused=fused or None)
-    steps = Adam(ours.parameters(), rate=0.01, decay=decay, fused=fused)
+    known = torch.optim.Adam(theirs.parameters(), lr=0.01, fused=True)
+    steps = Adam(ours.parameters(), rate=0.01)
     for _ in range(20):
         x = torch.randn(7, 5)
         for made, optimizer in ((ours, steps), (theirs, known)):

@@ -1,8 +1,7 @@
-"""Location and scale of numbers as smooth functions of the action."""
+"""Regression by polynomials: location and scale, as smooth as held-out rows ask."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from functools import reduce
 from itertools import combinations_with_replacement
@@ -51,10 +50,10 @@ class Polynomials(nn.Module):
             slopes.append(2 * values[..., k] + 2 * scaled * slopes[-1] - slopes[-2])
         slope = torch.stack(slopes[: values.shape[-1]], -1)
         factors, slopes = self._factors(values), self._factors(slope)
-        derivatives = []
-        for i, slope in enumerate(slopes):
-            others = factors[:i] + factors[i + 1 :]
-            derivatives.append(_product([slope / self.half_width[i], *others]))
+        derivatives = [
+            _product([own / width, *factors[:i], *factors[i + 1 :]])
+            for i, (own, width) in enumerate(zip(slopes, self.half_width, strict=True))
+        ]
         return _product(factors), torch.stack(derivatives, -1)
 
     def _scaled(self, rows: Tensor) -> Tensor:
@@ -68,12 +67,8 @@ class Polynomials(nn.Module):
 
     def _factors(self, values: Tensor) -> list[Tensor]:
         """Return the polynomial of each number in every product, (..., p) each."""
-        return [
-            each.index_select(-1, exponent)
-            for each, exponent in zip(
-                values.unbind(-2), self.exponents.unbind(-1), strict=True
-            )
-        ]
+        pairs = zip(values.unbind(-2), self.exponents.unbind(-1), strict=True)
+        return [each.index_select(-1, exponent) for each, exponent in pairs]
 
 
 def _product(factors: Sequence[Tensor]) -> Tensor:
@@ -91,14 +86,9 @@ def exponents_of(
     caps = [len(rows[:, i].unique()) - 1 for i in range(dim)]
     terms, sizes = [[0] * dim], [1]
     for degree in range(1, max_degree + 1):
-        new = [
-            exponent
-            for combination in combinations_with_replacement(range(dim), degree)
-            if all(
-                (exponent := [combination.count(i) for i in range(dim)])[i] <= caps[i]
-                for i in range(dim)
-            )
-        ]
+        drawn = combinations_with_replacement(range(dim), degree)
+        new = [[chosen.count(i) for i in range(dim)] for chosen in drawn]
+        new = [e for e in new if all(k <= cap for k, cap in zip(e, caps, strict=True))]
         if not new or len(terms) + len(new) > max_terms:
             break
         terms += new
@@ -122,7 +112,7 @@ def fit_location_and_scale(
     y: Tensor,
     test: Tensor,
     *,
-    num_iterations: int = 4,
+    num_iterations: int = 3,
 ) -> tuple[Tensor, Tensor]:
     r"""Regress location and scale of y by iterated weighted least squares.
 
@@ -148,17 +138,14 @@ def fit_location_and_scale(
     Returns:
         beta, shape (p, m), and gamma, shape (q, m).
     """
-    beta = y.new_zeros(0)
     floor = SMALLEST_SCALE * y.std(0, correction=0).clamp_min(1e-30)
-    ones = torch.zeros_like(y)
-    around_median = y - y.median(0).values
-    gamma = _fit_log_scale(noise_design, noise_sizes, around_median, floor, test)
-    log_scale = noise_design @ gamma
+    beta, residual = y.new_zeros(design.shape[1], y.shape[1]), y - y.median(0).values
+    gamma = _fit_log_scale(noise_design, noise_sizes, residual, floor, test)
     for _ in range(num_iterations):
+        log_scale = torch.maximum(noise_design @ gamma, floor.log())
         beta = _least_squares(design, sizes, y, log_scale, test)
         residual = y - design @ beta
         gamma = _fit_log_scale(noise_design, noise_sizes, residual, floor, test)
-        log_scale = torch.maximum(noise_design @ gamma, floor.log() + ones)
     return beta, gamma
 
 
@@ -169,9 +156,8 @@ def _fit_log_scale(
     log_size = size.log() + LOG_NORMAL_MEAN
     gamma = _least_squares(design, sizes, log_size, torch.zeros_like(size), test)
     z = (log_size - LOG_NORMAL_MEAN - design @ gamma).exp()
-    gamma[0] += (
-        0.5 * _tamed(z, z.median(0).values).square().mean(0).log()
-    )  # the root mean square becomes one
+    # The root mean square becomes one.
+    gamma[0] += 0.5 * _tamed(z, z.median(0).values).square().mean(0).log()
     return gamma
 
 
@@ -227,64 +213,3 @@ def best_prefix(
         beta[:size] = torch.where(better, solution, beta[:size])
         best = torch.where(better, error, best)
     return beta
-
-
-class ActionScaling(nn.Module):
-    r"""Numbers standardized given the action.
-
-    .. math::
-        \tilde y = \frac{y - \mu(\xi)}{\sigma(\xi)}, \qquad
-        \mu, \log \sigma \text{ polynomials of } \xi
-
-    of the degree that predicts held-out rows best. With one action it is the usual
-    z-score.
-
-    Args:
-        y: Shape (n, m), finite.
-        action: Actions, shape (n, action_dim).
-        max_degree: Largest degree that held-out rows choose from: Chebyshev polynomials
-            of degree 16 have 16 zeros over the actions.
-        max_noise_degree: Largest degree of the noise.
-    """
-
-    def __init__(
-        self,
-        y: Tensor,
-        action: Tensor,
-        *,
-        max_degree: int = 16,
-        max_noise_degree: int = 8,
-    ) -> None:
-        super().__init__()
-        y, test = y.double(), held_out(len(y))
-        mean, scale = y.mean(0), y.std(0, correction=0)
-        scale = torch.where(scale > 1e-12 * (1.0 + mean.abs()), scale, 1.0)
-        most = max(1, int((~test).sum()) // 10)
-        exponents, sizes = exponents_of(action, max_degree=max_degree, max_terms=most)
-        self.polynomials = Polynomials(action, exponents)
-        design = self.polynomials(action)
-        degrees = min(len(sizes), max_noise_degree + 1)
-        noise = design[:, : sizes[degrees - 1]]
-        beta, gamma = fit_location_and_scale(
-            design, sizes, noise, sizes[:degrees], (y - mean) / scale, test
-        )
-        log_scale = (noise @ gamma).clamp_min(math.log(SMALLEST_SCALE))
-        self.mean = nn.Buffer(mean)
-        self.scale = nn.Buffer(scale)
-        self.beta = nn.Buffer(beta)
-        self.gamma = nn.Buffer(gamma)
-        self.log_low = nn.Buffer(log_scale.min(0).values)
-        self.log_high = nn.Buffer(log_scale.max(0).values)
-
-    def location_and_scale(self, action: Tensor) -> tuple[Tensor, Tensor]:
-        """Return location and scale of y, each (n, m), in float64."""
-        design = self.polynomials(action)
-        log_scale = design[:, : len(self.gamma)] @ self.gamma
-        log_scale = log_scale.clamp(self.log_low, self.log_high)
-        location = self.mean + self.scale * (design @ self.beta)
-        return location, self.scale * log_scale.exp()
-
-    def forward(self, y: Tensor, action: Tensor) -> Tensor:
-        """Return y standardized, (n, m) and (n, action_dim) -> (n, m), in float64."""
-        location, scale = self.location_and_scale(action)
-        return (y.double() - location) / scale
