@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
@@ -184,9 +183,6 @@ class CampaignOptions:
         planned_trials: Trials that ``max_simulations`` is to last for; each further one
             gets half of what is left.
         workers: Workers that run all simulations, or the number of calls at a time.
-        bank: Folder of simulations that campaigns on the same simulator share one after
-            another: what is asked for again, by the same seed, parameters and action,
-            is read. None keeps them in the campaign's directory, if it has one.
         details: Further options that few campaigns change.
     """
 
@@ -202,7 +198,6 @@ class CampaignOptions:
     max_simulations: int | None = None
     planned_trials: int = 6
     workers: Workers = IN_PROCESS
-    bank: str | None = None
     details: CampaignDetails = CampaignDetails()
 
     def __getstate__(self) -> dict[str, Any]:
@@ -249,8 +244,6 @@ class CampaignOptions:
         )
 
     def __post_init__(self) -> None:
-        if self.bank is not None:
-            object.__setattr__(self, "bank", os.fspath(self.bank))
         object.__setattr__(self, "workers", Workers.of(self.workers))
         settings = {"refinement": RefinementOptions, "details": CampaignDetails}
         require_kinds(self, refine=bool, stop=StopRules, **settings)

@@ -292,7 +292,8 @@ class CampaignTrials(Telling[Trial]):
 
     def _charge(self) -> None:
         """Bring the costs up to date, unless the function is lacking that says them."""
-        if self._planner.has_cost or not self._storage.manifest.get("has_cost"):
+        limits = self._storage.manifest.get("limits", ())
+        if self._planner.has_cost or "cost" not in limits:
             self._planner.charge()
 
 

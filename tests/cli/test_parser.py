@@ -8,7 +8,6 @@ import pytest
 from sbi_active import __version__
 from sbi_active.campaign.learning import methods
 from sbi_active.cli import declare, main
-from sbi_active.tasks import TASKS  # pyright: ignore
 from tests.cli.sled import read, run
 
 #: Exit status, and which of what takes seconds to import has been imported.
@@ -77,7 +76,6 @@ def test_a_slip_is_json_as_well(line, kind, text, capfd):
 
 
 def test_names_are_those_of_the_library():
-    assert (*TASKS,) == declare.TASKS
     assert (*methods.METHODS,) == declare.METHODS
 
 

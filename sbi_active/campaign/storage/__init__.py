@@ -3,9 +3,3 @@
 This package contains the records, their checks, and the way to read them. It does not
 infer or design.
 """
-
-from sbi_active.renamed import former_names
-
-FORMER = {"DamagedCampaignError": "sbi_active.simulation.bank:CorruptSegmentError"}
-
-__getattr__ = former_names(__name__, FORMER)
