@@ -127,7 +127,7 @@ OUTCOME = [
     *(cli.DIR, cli.SIMULATOR, *cli.SPACE),
     cli.option("--names", "of the action's entries", metavar="A,B,..."),
     cli.option("--units", "of the action's entries", metavar="A,B,..."),
-    *(cli.METHOD, cli.SEED, cli.SETTINGS),
+    *(cli.METHOD, cli.SEED, cli.SETTINGS, cli.JSON),
 )
 def init(folder: Path, method: str, seed: int, **given: Any) -> cli.Answer:
     """Make a campaign in a new folder."""
@@ -141,7 +141,7 @@ def init(folder: Path, method: str, seed: int, **given: Any) -> cli.Answer:
         remember(folder, simulator=given["simulator"], noise=given["noise"])
         record.sum_up_campaign(campaign)
     text = f"{folder}: a campaign of {campaign.actions}\nnext: sbi-active ask {folder}"
-    return cli.Answer({}, text)
+    return cli.Answer({"directory": str(folder)}, text)
 
 
 @on_campaign(TARGET, need="simulator")

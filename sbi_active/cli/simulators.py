@@ -141,7 +141,7 @@ def run(task: str, out: Path, method: str, seed: int, **given: Any) -> cli.Answe
 
 @cli.command(
     *(cli.argument("simulator", "MODULE:FUNCTION", str), *cli.SPACE, cli.SEED),
-    cli.option("--rows", "a check", cli.COUNT, default=256),
+    *(cli.option("--rows", "a check", cli.COUNT, default=256), cli.JSON),
 )
 def check(rows: int, seed: int, **problem: Any) -> cli.Answer:
     """Look a simulator over before a campaign.
@@ -154,10 +154,10 @@ def check(rows: int, seed: int, **problem: Any) -> cli.Answer:
 
     *found, _ = problem_of(problem)
     report = check_simulator(*found, num_rows=rows, seed=seed)
-    return cli.Answer({}, str(report), 0 if report.is_ready else 1)
+    return cli.Answer({"report": f"{report}"}, f"{report}", int(not report.is_ready))
 
 
-@cli.command(cli.DIR)
+@cli.command(cli.DIR, cli.JSON)
 def migrate(folder: Path) -> cli.Answer:
     """Bring a campaign or bank of release 0.1 up to date."""
     from sbi_active.migration import migrate as migrated

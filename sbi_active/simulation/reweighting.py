@@ -99,7 +99,9 @@ def reuse(bank: Bank, target: Distribution) -> ReusedRows:
     table = bank.table()
     usable = (table["status"] != Outcome.MISSING) & np.isfinite(table["log_proposal"])
     rows = torch.from_numpy(usable.nonzero()[0])
-    expected = f"rows of {bank} from a known proposal, within the support of the target"
+    expected = (
+        f"rows of {bank.path} from a known proposal, within the support of the target"
+    )
     advice = "simulate from it with store=bank.drawn_from(prior)"
     require(len(rows) > 0, expected, "none whose proposal is known", advice)
     theta, log_own = (table[n][usable] for n in ("theta", "log_proposal"))

@@ -74,13 +74,18 @@ def given(name: str, *place: Any) -> Any:
     return thing
 
 
-def numbers(tensor: Tensor, is_array: bool) -> Any:
-    """Return an array, or a number, of numpy."""
-    return tensor.numpy() if is_array else tensor.numpy()[()]
+def few(values: Any) -> Tensor:
+    """Return a tensor of some numbers, which are read faster so."""
+    return torch.tensor(values, dtype=torch.float32)
+
+
+def numbers(tensor: Tensor) -> Any:
+    """Return an array of numpy, or a number where it has no axis."""
+    return tensor.numpy()[()]
 
 
 #: What a file may have called, besides what torch makes tensors by.
-CALLED = made, given, numbers, Message, frozenset
+CALLED = made, given, few, numbers, Message, frozenset
 PLAIN = set, frozenset, OrderedDict, torch.Size, torch.dtype, torch.nn.Parameter
 NAMED = {
     *(*CALLED, *PLAIN, *torch._storage_classes),
@@ -112,12 +117,13 @@ def encode(value: Any, *, known: Mapping[str, Any]) -> bytes:
             kind, place = type(obj), places.get(id(obj), ())
             if len(place) == 1 or place[1:] == ("fn",):  # may hold compiled models
                 return given, place
+            if kind is Tensor and obj.dtype is torch.float32 and 0 < obj.numel() <= 16:
+                return few, (obj.tolist(),)
             if kind is Tensor:  # without the rest of what it is a view of
                 own = obj.detach().cpu().clone().requires_grad_(obj.requires_grad)
                 return own.__reduce_ex__(2)
             if isinstance(obj, np.ndarray | np.generic) and obj.dtype.kind in "biufc":
-                tensor = torch.from_numpy(np.array(obj, order="C"))
-                return numbers, (tensor, isinstance(obj, np.ndarray))
+                return numbers, (torch.from_numpy(np.array(obj, order="C")),)
             if kind is Message:
                 return Message, (str(obj),)
             is_name = isinstance(obj, type | FunctionType) and obj in NAMED

@@ -98,9 +98,6 @@ class Bank:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def __repr__(self) -> str:
-        return f"Bank({str(self.path)!r}, name={self._name!r})"
-
     def __len__(self) -> int:
         return sum(len(rows) for rows, _ in self._segments())
 
@@ -126,7 +123,7 @@ class Bank:
         run) and ``log_proposal``.
         """
         parts = [rows for rows, _ in self._segments()]
-        require(bool(parts), f"rows in {self}", "none", "simulate into it")
+        require(bool(parts), f"rows in {self.path}", "none", "simulate into it")
         return np.concatenate(parts)
 
     def read(self, rows: Tensor | Sequence[int] | slice | None = None) -> Simulations:
@@ -197,7 +194,7 @@ class Bank:
             OSError: If the disk is full or cannot be written.
         """
         expected = "a bank opened with its simulator, to write to"
-        require(bool(self._mine), expected, f"{self}, which reads", "give simulator=")
+        require(bool(self._mine), expected, "one that is read", "give simulator=")
         self._store.acquire()
         columns = {n: own_tensor(rows[n], torch.float32, name=n) for n in SHAPED}
         columns |= {n: rows[n] for n in ("status", "index")}
@@ -267,6 +264,5 @@ class Bank:
 def row_type(shapes: Mapping[str, Sequence[int]]) -> np.dtype:
     """Return the type of a row but for x."""
     tables = [(name, "<f4", tuple(shapes[name])) for name in ("theta", "action")]
-    return np.dtype(
-        [("log_proposal", "<f8"), ("index", "<i8"), *tables, ("status", "i1")]
-    )
+    own = ("log_proposal", "<f8"), ("index", "<i8"), ("status", "i1")
+    return np.dtype([*own, *tables])
