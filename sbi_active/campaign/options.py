@@ -68,24 +68,16 @@ class StopRules:
             nats.
         max_sd: Largest standard deviation of any parameter under the belief: one
             number, or one a parameter, in the parameters' units.
-        calibration_lost: Whether to stop if the verdict of
-            :mod:`sbi_active.diagnostics` is "stop": the refined belief excludes what
-            two new inferences contain; or, if beliefs are the network's posterior, the
-            network excludes the truth too often at some action. This ends a campaign
-            whatever its health, at the cost of two inferences, or of 1,000 simulations,
-            a trial.
         budget: Total cost of all trials, in the unit of ``Campaign(cost=)``; without a
             cost, their number. A campaign ends once what is left affords no action.
 
     Example:
         >>> StopRules(min_information_gain=0.1, max_sd=[0.05, 0.2])
-        StopRules(min_information_gain=0.1, max_sd=(0.05, 0.2), calibration_lost=False,
-        budget=None)
+        StopRules(min_information_gain=0.1, max_sd=(0.05, 0.2), budget=None)
     """
 
     min_information_gain: float | None = None
     max_sd: float | Sequence[float] | None = None
-    calibration_lost: bool = False
     budget: float | None = None
 
     def __post_init__(self) -> None:

@@ -44,7 +44,7 @@ def test_nothing_heavy_is_imported(arguments, status, text):
 @pytest.mark.parametrize(
     ("line", "text"),
     [
-        ("run numerica --out d", "is not one of 'numerical'"),
+        ("run numerica --out d", "expected a task among 'numerical'"),
         ("run numerical --out d --rounds 0", "Invalid value for '--rounds': 0"),
         ("run numerical --out d --set sized=3", "expected a setting of a campaign"),
         ("run numerical --out d --set seed", "expected NAME=VALUE; got 'seed'"),

@@ -164,7 +164,7 @@ def decode(content: bytes | None, *, known: Mapping[str, Any]) -> Any:
         return torch.load(plain, weights_only=True)
     except Exception as error:  # each library has its own
         text = f"expected what this library stores; got {type(error).__name__}"
-        raise ValueError(f"{text}: {error!s:.200}; restore the file") from error
+        raise ValueError(f"{text}: {error!s:.60}; restore the file") from error
     finally:
         _KNOWN.reset(token)
 

@@ -230,7 +230,7 @@ def load(
     manifest, store, found = storage.manifest, storage.store, dict(given)
     with store.reading():
         kept = {what: decode(store.get(what), known={}) for what in given}
-        shape = torch.Size(manifest["x_shape"])
+        shape, bounded = torch.Size(manifest["x_shape"]), [*manifest["limits"]]
     for what, thing in kept.items():
         found[what] = thing if given[what] is None else given[what]
         if found[what] is None:
@@ -266,8 +266,8 @@ def load(
         own = {"belief": belief, "prior": getattr(belief, "prior", prior)}
         own |= {"simulator": None, "actions": found["actions"], "x_shape": shape}
         return SimpleNamespace(**own, state=state, _saved=None)
-    expected = f"the limits of actions that were declared, {manifest['limits']}"
-    require(limits == manifest["limits"], expected, limits, "pass cost=, constraint=")
+    expected = f"the limits of actions that were declared, {bounded}"
+    require(limits == bounded, expected, limits, "pass cost=, constraint=")
     require_effects("the effects of the campaign", manifest["effects"], effects)
     mine = fingerprint(simulator)
     if simulator_changed:
