@@ -329,9 +329,8 @@ def stored(method: Method) -> Method:
     def kept(campaign: Any, *arguments: Any, **options: Any) -> Any:
         storage, own = campaign._storage, campaign._learner.simulator
         version = campaign.state.version.number
-        expected = "the simulator, which is not stored with a campaign"
         advice = "pass it: Campaign.load(directory, simulator=...)"
-        require(own is not None, expected, "none", advice)
+        require(own is not None, "the simulator, which no folder has", "none", advice)
         if storage.store is not None:
             with storage.writing():  # before anything is computed
                 pass
@@ -348,4 +347,5 @@ def is_mean(simulator: Any, own: Any) -> bool:
     if not (isinstance(simulator, SimulatorModel) and isinstance(own, SimulatorModel)):
         return False
     parts = [(m.fn, *getattr(m, "effects", ())) for m in (simulator, own)]
-    return simulator.noise is None and [*map(id, parts[0])] == [*map(id, parts[1])]
+    is_same = [*map(id, parts[0])] == [*map(id, parts[1])]
+    return is_same and simulator.noise is None and own.noise is not None

@@ -1,12 +1,14 @@
 """Campaigns that go on from their directory, as if they had never been left."""
 
+import copy
 import pickle
 
 import pytest
 import torch
 from torch.distributions import Uniform
 
-from sbi_active import Bank, BoxActions, Campaign
+from sbi_active import Bank, BoxActions, Campaign, SimulatorModel
+from sbi_active.campaign.storage.directory import is_mean
 from sbi_active.simulation import reuse
 from sbi_active.simulation.bank import LockedError
 from tests.campaign.storage.campaigns import (
@@ -263,6 +265,17 @@ def test_rows_of_a_campaign_are_used_again(tmp_path):
         assert campaign.posterior is not None  # the first round's network
     worth = reuse(Bank(tmp_path / "c", name="drawn"), PRIOR).effective_sample_size
     assert worth == pytest.approx(OPTIONS.num_simulations)
+
+
+def test_rows_are_kept_of_a_simulator_and_of_its_mean_alone():
+    mean = copy.copy(MODEL)
+    mean.noise = None
+    assert is_mean(mean, MODEL)
+    assert not is_mean(drawn, MODEL)
+    drifting = SimulatorModel(drawn)
+    later = copy.copy(drifting)
+    later.next_index = 3  # another simulator, with other rows
+    assert not is_mean(later, drifting)
 
 
 def test_a_pickled_copy_lives_in_memory(tmp_path):
