@@ -72,9 +72,9 @@ from sbi_active.simulation import reuse
 
 folder = tempfile.mkdtemp()
 with Bank(folder, simulator=model) as bank:
-    simulate(model, theta, action, seed=0, store=bank.drawn_from(prior, label="prior"))
+    simulate(model, theta, action, seed=0, store=bank.drawn_from(prior))
     narrower = BoxUniform(torch.tensor([0.3]), torch.tensor([0.5]))
-    reused = reuse(bank, narrower, proposals={"prior": prior})
+    reused = reuse(bank, narrower)
 print(
     f"{len(theta)} rows of the wide prior, {reused.effective_sample_size:.0f} of the "
     "narrow one"
@@ -99,6 +99,6 @@ print(campaign.belief)
 print("simulated", campaign.state.meter.spent, "of", options.max_simulations)
 
 # %% [markdown]
-# With `bank="folder"` and `workers=Workers(8, time_limit=600)` these rows are kept, run
+# With `directory="folder"` and `workers=Workers(8, time_limit=600)` these rows are kept, run
 # side by side and given up after ten minutes: see [how
 # many](../howto/how_many_simulations.md).

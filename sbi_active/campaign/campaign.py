@@ -21,8 +21,13 @@ from sbi_active.campaign.learning.pooled import make_learner
 from sbi_active.campaign.learning.revision import recompute, revise
 from sbi_active.campaign.options import CampaignOptions
 from sbi_active.campaign.state import CampaignState, Trial
-from sbi_active.campaign.storage.directory import Storage, make_campaign, stored
-from sbi_active.campaign.storage.loading import load
+from sbi_active.campaign.storage.directory import (
+    Storage,
+    facts_of,
+    load,
+    make_campaign,
+    stored,
+)
 from sbi_active.campaign.trials import CampaignTrials
 from sbi_active.design.limits import Cost
 from sbi_active.design.target import Target
@@ -117,15 +122,12 @@ class Campaign(CampaignTrials):
         planner = Planner(actions, state, effects, **limits)
         folder = None if directory is None else Path(directory)
         if folder is not None:
-            make_campaign(
-                folder,
-                state,
-                {"prior": prior, "actions": actions, "options": options},
-                simulator,
-                x_shape=[*learner.x_shape],
-                effects=[effect.name for effect in effects],
-                **{f"has_{what}": limit is not None for what, limit in limits.items()},
-            )
+            given = {"prior": prior, "actions": actions, "options": options}
+            facts = facts_of(state, simulator)
+            facts["limits"] = [n for n in limits if limits[n] is not None]
+            facts["effects"] = [effect.name for effect in effects]
+            facts["x_shape"] = [*learner.x_shape]
+            make_campaign(folder, given, facts)
         self._begin(learner, planner, Storage(folder, prior=prior), show_progress)
 
     def _begin(
@@ -136,7 +138,6 @@ class Campaign(CampaignTrials):
         self._learner, self._planner, self._storage = learner, planner, storage
         self.state.show_progress = show_progress
         self._charge()
-        storage.bank = self.state.options.bank
 
     @classmethod
     @suggests
@@ -195,11 +196,11 @@ class Campaign(CampaignTrials):
             simulator,
             given=given,
             effects=effects,
-            limits=limits,
+            limits=[n for n in limits if limits[n] is not None],
             simulator_changed=simulator_changed,
         )
-        declared = [e for e in effects if e.name in storage.manifest["effects"]]
-        planner = Planner(learner.actions, learner.state, declared, **limits)
+        lacked = [e for e in effects if e.name in storage.manifest["effects"]]
+        planner = Planner(learner.actions, learner.state, lacked, **limits)
         self = cls.__new__(cls)
         self._begin(learner, planner, storage, show_progress)
         return self
@@ -318,7 +319,7 @@ class Campaign(CampaignTrials):
         Args:
             real_system: Function that takes an action, shape (action_dim,), and gives
                 x.
-            num_rounds: Trials to run.
+            num_rounds: Trials to run beyond those told before; a pending one is first.
             on_round: Function that is called with each trial once the belief contains
                 it.
 

@@ -1,7 +1,7 @@
 """Whether the simulator still explains the trials: all of them, and each.
 
 The health judges the trials together as they come. Single outcomes that nothing in the
-prior explains are named and left out. The calibration asks about the inference.
+prior explains are named and left out.
 """
 
 from __future__ import annotations
@@ -16,11 +16,8 @@ from torch import Tensor
 from torch.distributions import Distribution
 
 from sbi_active.campaign.state import FAR, CampaignState, ModelVersion, Trial
-from sbi_active.diagnostics.beliefs import check_belief
-from sbi_active.diagnostics.check import check_calibration
 from sbi_active.inference.beliefs.belief import UnchangedBelief
 from sbi_active.inference.beliefs.diagnostics import Diagnostics
-from sbi_active.seeding import derive_seed
 
 Health = Literal["ok", "watch", "alarm"]
 
@@ -142,28 +139,6 @@ def error_nats(diagnostics: Diagnostics) -> float:
     if modes is not None and not modes.holds:
         return math.inf  # whatever the other figures say of those that were found
     return diagnostics.error_nats_if_explained or 0.0
-
-
-def calibration_lost(campaign: Any) -> str | None:
-    """Return why not to go on, or None.
-
-    A refined belief is inferred twice again from the same trials; for a chained one the
-    network that gives the next belief is checked.
-
-    Args:
-        campaign: Campaign of a method with a posterior, or with refined beliefs.
-    """
-    state = campaign.state
-    if not state.explained:
-        return None
-    seed = derive_seed(state.seed, "calibration", len(state.processed))
-    if state.options.refine:
-        found: Any = check_belief(campaign, num_repeats=0, seed=seed)
-    else:
-        found = check_calibration(campaign, gap="classifier", seed=seed)
-    if found.verdict != "stop":
-        return None
-    return f"calibration is lost: {found.reasons[0]}"
 
 
 def is_suspect(trial: Trial, suspect: float = 0.01) -> bool:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
@@ -69,24 +68,16 @@ class StopRules:
             nats.
         max_sd: Largest standard deviation of any parameter under the belief: one
             number, or one a parameter, in the parameters' units.
-        calibration_lost: Whether to stop if the verdict of
-            :mod:`sbi_active.diagnostics` is "stop": the refined belief excludes what
-            two new inferences contain; or, if beliefs are the network's posterior, the
-            network excludes the truth too often at some action. This ends a campaign
-            whatever its health, at the cost of two inferences, or of 1,000 simulations,
-            a trial.
         budget: Total cost of all trials, in the unit of ``Campaign(cost=)``; without a
             cost, their number. A campaign ends once what is left affords no action.
 
     Example:
         >>> StopRules(min_information_gain=0.1, max_sd=[0.05, 0.2])
-        StopRules(min_information_gain=0.1, max_sd=(0.05, 0.2), calibration_lost=False,
-        budget=None)
+        StopRules(min_information_gain=0.1, max_sd=(0.05, 0.2), budget=None)
     """
 
     min_information_gain: float | None = None
     max_sd: float | Sequence[float] | None = None
-    calibration_lost: bool = False
     budget: float | None = None
 
     def __post_init__(self) -> None:
@@ -184,9 +175,6 @@ class CampaignOptions:
         planned_trials: Trials that ``max_simulations`` is to last for; each further one
             gets half of what is left.
         workers: Workers that run all simulations, or the number of calls at a time.
-        bank: Folder of simulations that campaigns on the same simulator share one after
-            another: what is asked for again, by the same seed, parameters and action,
-            is read. None keeps them in the campaign's directory, if it has one.
         details: Further options that few campaigns change.
     """
 
@@ -202,7 +190,6 @@ class CampaignOptions:
     max_simulations: int | None = None
     planned_trials: int = 6
     workers: Workers = IN_PROCESS
-    bank: str | None = None
     details: CampaignDetails = CampaignDetails()
 
     def __getstate__(self) -> dict[str, Any]:
@@ -249,8 +236,6 @@ class CampaignOptions:
         )
 
     def __post_init__(self) -> None:
-        if self.bank is not None:
-            object.__setattr__(self, "bank", os.fspath(self.bank))
         object.__setattr__(self, "workers", Workers.of(self.workers))
         settings = {"refinement": RefinementOptions, "details": CampaignDetails}
         require_kinds(self, refine=bool, stop=StopRules, **settings)

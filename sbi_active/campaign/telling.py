@@ -14,7 +14,6 @@ from datetime import datetime, timezone
 from typing import TYPE_CHECKING, Any, Generic, Literal, TypeVar
 
 from sbi_active.expected import require
-from sbi_active.messages import Explained
 
 if TYPE_CHECKING:
     import numpy as np
@@ -28,19 +27,6 @@ Status = Literal["pending", "ok", "invalid", "missing", "withdrawn"]
 #: Records of a campaign's store: what happened, what was computed from it, and what a
 #: reader without torch needs of that.
 LOG, STATE, SUMMARY = "log", "state", "summary"
-
-
-class LogChangedError(Explained, ValueError):
-    """Another writer added to a campaign since it was loaded here."""
-
-    code = "SA607"
-
-    def __init__(self, folder: Any) -> None:
-        super().__init__(
-            f"expected the campaign in {folder} as it was loaded; got trials that "
-            "another process told since; load it again, and tell this once more: "
-            "nothing was written"
-        )
 
 
 @dataclass(frozen=True)

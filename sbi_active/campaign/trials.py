@@ -18,11 +18,10 @@ from sbi_active.campaign.display.page import campaign_html, to_dataframe
 from sbi_active.campaign.health import (
     Health,
     assess,
-    calibration_lost,
     doubts,
     in_doubt,
 )
-from sbi_active.campaign.isolation import guarded, isolated
+from sbi_active.campaign.isolation import guarded
 from sbi_active.campaign.state import CampaignState, Trial, tensor_of
 from sbi_active.campaign.storage.directory import Storage
 from sbi_active.campaign.telling import Facts, Telling, listed
@@ -202,19 +201,12 @@ class CampaignTrials(Telling[Trial]):
     def stop_reason(self) -> str | None:
         """Why ``options.stop`` says to stop, after the trials the belief contains.
 
-        None while the health is not "ok", but for a lost calibration and a budget that
-        is spent: a confident wrong belief would stop first.
+        None while the health is not "ok", but for a budget that is spent: a confident
+        wrong belief would stop first.
         """
         for reason in (self.state.used_up, self._planner.spent_up):
             if reason is not None:
                 return reason
-        if self.state.options.stop.calibration_lost:
-            key = (*self.state.processed, self.state.version.number)
-            known = self.__dict__.setdefault("_calibrations", {})
-            if key not in known:
-                known[key] = isolated(calibration_lost)(self)
-            if known[key] is not None:
-                return known[key]
         if self.health != "ok":
             return None
         design = None if self.pending is None else self.pending.design
@@ -292,7 +284,8 @@ class CampaignTrials(Telling[Trial]):
 
     def _charge(self) -> None:
         """Bring the costs up to date, unless the function is lacking that says them."""
-        if self._planner.has_cost or not self._storage.manifest.get("has_cost"):
+        limits = self._storage.manifest.get("limits", ())
+        if self._planner.has_cost or "cost" not in limits:
             self._planner.charge()
 
 

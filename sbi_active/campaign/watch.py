@@ -19,7 +19,6 @@ from urllib.parse import quote, urlsplit
 
 from sbi_active.campaign.campaign import Campaign
 from sbi_active.campaign.display.page import page
-from sbi_active.campaign.telling import LOG, STATE
 from sbi_active.display.page import templates
 from sbi_active.simulation.bank.store import LOCK, Store
 
@@ -53,7 +52,7 @@ class Watched:
         return json.dumps({"seal": self._seal, "doing": self._doing()})
 
     def _now(self) -> str:
-        return Store(self._folder, "campaign").seal(LOG, STATE)
+        return Store(self._folder, "campaign").seal("-wal")
 
     def _doing(self) -> str:
         """Return what the campaign waits for: the robot, or a process that has it."""

@@ -8,6 +8,7 @@ Nothing in it imports torch before a command needs it: commands import what they
 from __future__ import annotations
 
 import contextlib
+import logging
 import os
 import sys
 import warnings
@@ -40,6 +41,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     if shell := os.environ.get(variable := "_SBI_ACTIVE_COMPLETE"):
         return shell_complete(cli.program, {}, cli.NAME, variable, shell)
     is_json = "--json" in words
+    logging.getLogger("sbi_active").setLevel(logging.INFO)
+    logging.getLogger("sbi_active").handlers = [cli.Progress()]
     with contextlib.suppress(AttributeError, ValueError):
         # A terminal that has no such letter shows its number.
         sys.stdout.reconfigure(errors="backslashreplace")  # type: ignore

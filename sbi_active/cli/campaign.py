@@ -19,12 +19,11 @@ from typing import Any
 
 import click
 
-from sbi_active.campaign.telling import LogChangedError, flat, shaped
+from sbi_active.campaign.telling import flat, shaped
 from sbi_active.cli import declare as cli
 from sbi_active.cli import record
 from sbi_active.expected import require
-from sbi_active.simulation.bank.errors import LockedError
-from sbi_active.simulation.bank.store import PATIENCE
+from sbi_active.simulation.bank.store import PATIENCE, LockedError, LogChangedError
 
 #: Commands on a campaign by name, which a request may call too.
 ON_CAMPAIGN: dict[str, click.Command] = {}
@@ -128,7 +127,7 @@ OUTCOME = [
     *(cli.DIR, cli.SIMULATOR, *cli.SPACE),
     cli.option("--names", "of the action's entries", metavar="A,B,..."),
     cli.option("--units", "of the action's entries", metavar="A,B,..."),
-    *(cli.METHOD, cli.SEED, cli.SETTINGS),
+    *(cli.METHOD, cli.SEED, cli.SETTINGS, cli.JSON),
 )
 def init(folder: Path, method: str, seed: int, **given: Any) -> cli.Answer:
     """Make a campaign in a new folder."""
@@ -142,7 +141,7 @@ def init(folder: Path, method: str, seed: int, **given: Any) -> cli.Answer:
         remember(folder, simulator=given["simulator"], noise=given["noise"])
         record.sum_up_campaign(campaign)
     text = f"{folder}: a campaign of {campaign.actions}\nnext: sbi-active ask {folder}"
-    return cli.Answer({}, text)
+    return cli.Answer({"directory": str(folder)}, text)
 
 
 @on_campaign(TARGET, need="simulator")
@@ -156,8 +155,8 @@ def ask(campaign: Any, target: str) -> cli.Answer:
     data["notes"] = [*getattr(trial.design, "notes", ())]
     lines = [f"trial {trial.index}: {record.place_of(data)}{tells}"]
     lines += [f"note: {note}" for note in data["notes"]]
-    lines += [f"then: sbi-active tell {campaign.directory}"]
-    return cli.Answer(data, "\n".join(lines))
+    then = f"then: sbi-active tell {campaign.directory}"
+    return cli.Answer(data, "\n".join([*lines, then]))
 
 
 @on_campaign(*OUTCOME, AT, need="record")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import ctypes
 import json
+import logging
 import math
 import os
 import re
@@ -23,13 +24,9 @@ NAME = "sbi-active"
 FAILED, MISUSED, INTERRUPTED = 1, 2, 130
 #: What a call raises that is none: of other names, types, files, or nested too deeply.
 MISUSES = TypeError, AttributeError, ImportError, FileNotFoundError, RecursionError
+MISUSES += json.JSONDecodeError, UnicodeDecodeError
 #: Frames in what a worker says of an error, which is told without them.
 FRAMES = re.compile(r"Traceback \(most recent call last\):\n(?: .*\n)*")
-#: Names of the tasks, as in ``sbi_active.tasks.TASKS``.
-TASKS = (
-    *("numerical", "oscillator", "box_collision", "pouring", "pouring_real"),
-    *("servo_pendulum", "ball_drops", "location_finding", "chain"),
-)
 #: Names of the methods, as in ``sbi_active.campaign.learning.methods.METHODS``.
 METHODS = ("asbi", "nsbi", "alhi", "nlhi", "seqbed")
 
@@ -66,7 +63,6 @@ program = click.Group(
     "call or a file has to be changed; 10 to 14 where a gate is closed; 130 after an "
     "interrupt.",
     context_settings={"help_option_names": ["-h", "--help"]},
-    no_args_is_help=False,
 )
 click.version_option(package_name=NAME, message="%(version)s")(program)
 
@@ -111,7 +107,7 @@ def argument(name: str, metavar: str, type: Any, **more: Any) -> click.Argument:
 NUMBERS, COUNT = Numbers(), click.IntRange(min=1)
 FILE, FOLDER = click.Path(path_type=Path), click.Path(path_type=Path, file_okay=False)
 DIR = argument("folder", "DIR", FOLDER)
-TASK = option("--task", "in place of a simulator", click.Choice(TASKS))
+TASK = option("--task", "in place of a simulator", metavar="TASK")
 OF_TASK = repeated("--option", "of the task, as variant=sinh", "NAME=VALUE")
 METHOD = option("--method", "by which it learns", click.Choice(METHODS), default="asbi")
 SEED = option("--seed", "of all that is random", int, default=0)
@@ -131,6 +127,14 @@ SPACE = [
 def say(said: object) -> None:
     """Print a note or an error to standard error."""
     click.echo(f"sbi-active: {said}", err=True)
+
+
+class Progress(logging.Handler):
+    """Says on standard error what takes long."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Print a line of the library's log."""
+        say(record.getMessage())
 
 
 def failure(error: BaseException) -> dict[str, Any]:
@@ -215,7 +219,6 @@ def number_of(text: str, *, is_outcome: bool = False) -> float:
         value = math.inf
     is_held = value == 0 or 2.0**-126 <= abs(value) <= 2.0**128 - 2.0**104
     advice = "write them with a point, as in 1.5 or 2e-3, without a unit"
-    advice += ", several apart by blanks" * ("," in text)
     is_right = is_held or is_outcome and math.isnan(value)
     require(is_right, "finite numbers of float32", f"{text!r:.80}", advice)
     return value

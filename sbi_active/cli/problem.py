@@ -34,11 +34,6 @@ from sbi_active.expected import require
 from sbi_active.simulation import GaussianNoise, SimulatorModel
 from sbi_active.tasks import Task, get_task  # pyright: ignore
 
-#: Actions of one space. A choice: each is stored in the campaign's folder and takes
-#: part in each design; twice as many take twice the memory, and half are still more
-#: than any design tells apart.
-MOST_ACTIONS = 100_000
-
 
 def load_module(place: str, here: str | None = None) -> tuple[Any, str]:
     """Import what ``module:name`` or ``path/file.py:name`` names.
@@ -92,7 +87,7 @@ def task_of(name: str, texts: Sequence[str]) -> Task:
     """Return a task with the options of a command line.
 
     Args:
-        name: Name among ``TASKS``.
+        name: Name of the task.
         texts: Options, each ``NAME=VALUE``.
 
     Raises:
@@ -181,14 +176,15 @@ def actions_of(specs: Sequence[str]) -> ActionSpace:
     return DiscreteActions(torch.cartesian_prod(*map(_values_of, specs)))
 
 
-def _values_of(spec: str) -> Tensor:
+def _values_of(spec: str, most: int = 100_000) -> Tensor:
+    """Return the values of an entry; ``most`` are more than any design tells apart."""
     low, *rest = spec.split(":")
     if not rest:
         return torch.tensor([*map(number_of, spec.split(","))])
     count = int(rest[1]) if len(rest) == 2 and rest[1].isdecimal() else 0
-    expected = f"LOW:HIGH:COUNT of at most {MOST_ACTIONS} actions, or A,B,..."
+    expected = f"LOW:HIGH:COUNT of at most {most} actions, or A,B,..."
     advice = "write, say, 0:5:11; declare a mix of limits and values as actions"
-    require(0 < count <= MOST_ACTIONS, expected, repr(spec), advice)
+    require(0 < count <= most, expected, repr(spec), advice)
     return torch.linspace(number_of(low), number_of(rest[0]), count)
 
 

@@ -31,7 +31,7 @@ def digest(folder: Path) -> str:
     Args:
         folder: Folder of the campaign.
     """
-    return Store(folder, "campaign").seal(telling.LOG, telling.STATE)
+    return Store(folder, "campaign").seal("-wal")
 
 
 class Record(Telling[Any]):
@@ -56,7 +56,7 @@ class Record(Telling[Any]):
             self._kept: Any = [SimpleNamespace(**t) for t in self._known["trials"]]
             self.actions = SimpleNamespace(**self._known["actions"])
             self._num: int = self._known["lines"]
-            for number in range(self._num + 1, store.length(telling.LOG) + 1):
+            for number in range(self._num + 1, store.catalog.get(telling.LOG, 0) + 1):
                 self._take(store.json(telling.LOG, number) or {})
         except (OSError, ValueError, RecursionError, LookupError, TypeError) as error:
             raise Unsure from error
@@ -103,12 +103,8 @@ class Record(Telling[Any]):
     def _record(self, event: str, facts: Facts) -> Any:
         line = telling.event_of(event, facts)
         store = Store(self.directory, "campaign")
-        with contextlib.closing(store), store.writing():
-            is_known = store.length(telling.LOG) == self._num  # else others were faster
-            if is_known:
-                store.append(telling.LOG, line)
-        if not is_known:
-            raise telling.LogChangedError(self.directory)
+        with contextlib.closing(store), store.writing(telling.LOG, self._num):
+            store.append(telling.LOG, line)
         self._take(line)
         return self._kept[facts.index]
 

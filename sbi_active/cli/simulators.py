@@ -8,8 +8,6 @@ import sys
 from pathlib import Path
 from typing import Any
 
-import click
-
 from sbi_active.cli import declare as cli
 from sbi_active.cli.campaign import Session
 from sbi_active.cli.record import answer_of, sum_up_campaign
@@ -103,7 +101,7 @@ def _compared(path: Path, given: dict[str, Any]) -> cli.Answer:
 
 
 @cli.command(
-    cli.argument("task", "TASK", click.Choice(cli.TASKS)),
+    cli.argument("task", "TASK", str),
     *(cli.METHOD, cli.SEED, cli.OF_TASK, cli.SETTINGS, cli.JSON),
     cli.option("--rounds", "real trials", cli.COUNT, default=4),
     cli.option("--out", "folder for the results", cli.FOLDER, "DIR", required=True),
@@ -143,13 +141,9 @@ def run(task: str, out: Path, method: str, seed: int, **given: Any) -> cli.Answe
 
 @cli.command(
     *(cli.argument("simulator", "MODULE:FUNCTION", str), *cli.SPACE, cli.SEED),
-    cli.option("--rows", "a check", cli.COUNT, default=256),
-    cli.option("--simulations", "of a campaign, to tell its time", cli.COUNT),
-    cli.option("--workers", "that share them", cli.COUNT, default=1),
+    *(cli.option("--rows", "a check", cli.COUNT, default=256), cli.JSON),
 )
-def check(
-    rows: int, simulations: int | None, workers: int, seed: int, **problem: Any
-) -> cli.Answer:
+def check(rows: int, seed: int, **problem: Any) -> cli.Answer:
     """Look a simulator over before a campaign.
 
     Shapes, seeds, noise, lost rows, time, and parameters that change nothing; exit
@@ -159,12 +153,11 @@ def check(
     from sbi_active.simulation import check_simulator
 
     *found, _ = problem_of(problem)
-    how: Any = {"num_simulations": simulations, "workers": workers, "seed": seed}
-    report = check_simulator(*found, num_rows=rows, **how)
-    return cli.Answer({}, str(report), 0 if report.is_ready else 1)
+    report = check_simulator(*found, num_rows=rows, seed=seed)
+    return cli.Answer({"report": f"{report}"}, f"{report}", int(not report.is_ready))
 
 
-@cli.command(cli.DIR)
+@cli.command(cli.DIR, cli.JSON)
 def migrate(folder: Path) -> cli.Answer:
     """Bring a campaign or bank of release 0.1 up to date."""
     from sbi_active.migration import migrate as migrated

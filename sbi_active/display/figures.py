@@ -51,6 +51,8 @@ def legible(figure: Figure) -> Figure:
     for axis in figure.findobj(Axis):
         assert isinstance(axis, Axis)
         given = axis.get_major_formatter()
+        if axis.get_scale() != "linear":  # whose ticks are formulas
+            axis.set_major_formatter("{x:g}")
         if isinstance(given, FuncFormatter):  # names at ticks are set at each drawing
             axis.set_major_formatter(lambda *at, given=given: _seen(given(*at)))
     for text in figure.findobj(Text):

@@ -12,14 +12,18 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from sbi_active.campaign.storage.codec import decode, encode
-from sbi_active.campaign.storage.directory import BELIEF, FOR_PEOPLE, write_campaign
-from sbi_active.campaign.telling import LOG, STATE
+from sbi_active.campaign.storage.directory import FOR_PEOPLE, make_campaign
+from sbi_active.campaign.telling import LOG
 from sbi_active.messages import warn
 from sbi_active.migration.described import actions_from, options_from, prior_from
 from sbi_active.migration.segments import copy_bank
-from sbi_active.simulation.bank.errors import CorruptSegmentError
-from sbi_active.simulation.bank.store import NAME, TEMPORARY, Store, synchronize
+from sbi_active.simulation.bank.store import (
+    NAME,
+    TEMPORARY,
+    Store,
+    synchronize,
+    whole,
+)
 
 BEFORE = "version-1"  # gets the files of before
 #: What release 0.1 wrote into a folder.
@@ -27,8 +31,6 @@ OWN = re.compile(
     r"campaign\.json(\.copy)?|trials\.jsonl|trials\.damaged(-\d+)?|state\.bin(\.damaged)?"
     r"|belief-[0-9a-f]+\.bin|simulations(-\d+)?|writer\.(lock|json)|bank\.json|segments"
 )
-#: Entries of a state that its first writers did not have.
-ADDED = {"draws": {}, "batches": [], "num_simulated": 0}
 
 
 def migrate(folder: Path) -> dict[str, int]:
@@ -92,30 +94,22 @@ def _banks(folder: Path) -> dict[str, Path]:
 
 
 def _copy_campaign(folder: Path, made: Path) -> int:
+    """Write what a campaign was and its log; all else is computed again."""
     manifest = _manifest(folder)
     readers = {"prior": prior_from, "actions": actions_from, "options": options_from}
-    objects = {
-        what: encode(read(manifest[what]), known={})
+    described = {what: manifest.pop(what) for what in readers}
+    given = {
+        what: read(described[what])
         for what, read in readers.items()
-        if manifest[what] is not None
+        if described[what] is not None
     }
-    own = [what for what in readers if what not in objects]
-    kept = {name: value for name, value in manifest.items() if name not in readers}
-    write_campaign(made, {**kept, "own": own}, objects)
+    limits = [what for what in ("cost", "constraint") if manifest.pop(f"has_{what}")]
+    make_campaign(made, given, {**manifest, "limits": limits})
     store = Store(made, "campaign")
     entries = _entries(folder / "trials.jsonl")
     for entry in entries:
         with store.writing():
             store.append(LOG, entry)
-    saved = _content(folder / "state.bin")
-    if saved is not None:
-        state = {**ADDED, **decode(saved, known={})}
-        state.pop("digest", None)
-        with store.writing():
-            if state["belief"] is not None:  # "" where it could not be stored
-                path = folder / (state["belief"] or "none")
-                store.put(BELIEF, 0, _content(path) or b"")
-            store.put(STATE, 0, encode(state, known={}))
     store.close()
     return len(entries)
 
@@ -136,7 +130,8 @@ def _manifest(folder: Path) -> dict[str, Any]:
                 )
         except (OSError, KeyError, AttributeError, TypeError, json.JSONDecodeError):
             continue
-    raise CorruptSegmentError(path, "a manifest with another checksum")
+    whole(path, False, "a manifest with another checksum")
+    return {}
 
 
 def _entries(path: Path) -> list[Mapping[str, Any]]:
@@ -150,17 +145,7 @@ def _entries(path: Path) -> list[Mapping[str, Any]]:
         head, _, tail = line.rpartition(b', "crc": "')
         text = head + b"}"
         if tail != f'{zlib.crc32(text):08x}"}}'.encode():
-            raise CorruptSegmentError(
-                path, f"line {number} with another checksum: open it by release 0.1"
-            )
+            text = f"line {number} with another checksum: open it by release 0.1"
+            whole(path, False, text)
         entries.append(json.loads(text))
     return entries
-
-
-def _content(path: Path) -> bytes | None:
-    """Return what a file holds after its checksum; None if it is not that."""
-    if not path.exists():
-        return None
-    digest, _, content = path.read_bytes().partition(b"\n")
-    same = hashlib.sha256(content).hexdigest().encode() == digest
-    return content if same else None

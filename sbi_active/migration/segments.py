@@ -14,8 +14,7 @@ import numpy as np
 import torch
 
 from sbi_active.simulation.bank.bank import SHAPED, Bank
-from sbi_active.simulation.bank.errors import CorruptSegmentError, whole
-from sbi_active.simulation.bank.store import Store
+from sbi_active.simulation.bank.store import CorruptSegmentError, Store, whole
 
 COLUMNS = (*SHAPED, "status", "index", "log_proposal")
 NAME = re.compile(r"(\d{8})-(\d{8})\.h5")
@@ -40,13 +39,14 @@ def copy_bank(folder: Path, store: Store, name: str) -> int:
     try:
         header = dict(json.loads(path.read_bytes()))
     except (ValueError, TypeError) as error:
-        raise CorruptSegmentError(path, f"no header ({error})") from error
+        whole(path, False, f"no header ({error})")
     kept = ("created", "version", "simulator", "parameter_names", "shapes")
     lacking = [key for key in kept if key not in header]
     whole(path, not lacking and header.get("format") == 1, "no header of release 0.1")
     with store.writing():
-        store.put(f"bank {name}", 0, {key: header[key] for key in kept})
+        store.put(f"bank {name}", {key: header[key] for key in kept})
     into, total = Bank(store, name=name), 0
+    into._mine = into.header  # which has no function
     for file in _files(folder, header):
         columns, runs = _read(file)
         run = columns.pop("run")
@@ -55,9 +55,9 @@ def copy_bank(folder: Path, store: Store, name: str) -> int:
         starts = np.flatnonzero(np.diff(run, prepend=-1))
         for start, stop in pairwise([*starts, len(run)]):
             own = runs[run[start]]
-            own = {"run": own["digest"], "seed": own["seed"], "label": own["label"]}
-            part = {key: columns[key][start:stop] for key in COLUMNS}
-            into._write(own, {k: torch.from_numpy(v.copy()) for k, v in part.items()})
+            part = {key: columns[key][start:stop].copy() for key in COLUMNS}
+            rows = {key: torch.from_numpy(column) for key, column in part.items()}
+            into.save(own["digest"], seed=own["seed"], **rows)
     return total
 
 
@@ -103,7 +103,7 @@ def _read(path: Path) -> tuple[dict[str, np.ndarray], list[dict[str, Any]]]:
         raise
     except Exception as error:  # HDF5 has many
         reason = f"a file that HDF5 cannot read ({error or type(error).__name__})"
-        raise CorruptSegmentError(path, reason) from error
+        whole(path, False, reason)
     return columns, meta["runs"]
 
 

@@ -2,7 +2,6 @@
 
 import math
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,15 +10,13 @@ from scipy.integrate import quad
 from scipy.stats import binom
 from torch.distributions import MultivariateNormal, Normal
 
-from sbi_active import StopRules
-from sbi_active.campaign import CampaignOptions, Trial, health
+from sbi_active.campaign import CampaignOptions, Trial
 from sbi_active.campaign.health import assess, log_e_value
 from sbi_active.campaign.score import SHARES, Spread, score_outcome
 from sbi_active.campaign.state import CampaignState, ModelVersion
 from sbi_active.inference.sampling.weights import silverman
 from sbi_active.seeding import derive_seed, forked_generators
 from sbi_active.simulation import simulate
-from tests.campaign.problem import campaign
 
 PRIOR = MultivariateNormal(torch.zeros(1), torch.eye(1))
 ACTION = torch.tensor([2.0])
@@ -109,25 +106,6 @@ def test_alarms_are_rare_unless_predictions_fail(effect):
     else:  # the level, and 3 of its binomial errors
         level = 0.025
         assert alarms / num < level + 3 * math.sqrt(level * (1 - level) / num)
-
-
-@pytest.mark.parametrize("refine", [True, False])
-def test_a_lost_calibration_stops_and_is_judged_once(refine, monkeypatch):
-    calls = []
-
-    def check(*_, **__):
-        calls.append(1)
-        return SimpleNamespace(
-            verdict="stop" if len(calls) > 1 else "trust",
-            reasons=("it excludes the truth",),
-        )
-
-    name = "check_belief" if refine else "check_calibration"
-    monkeypatch.setattr(health, name, check)
-    c = campaign(stop=StopRules(calibration_lost=True), refine=refine)
-    c.run(lambda action: 0.4 * action, num_rounds=3)
-    assert len(c.history) == len(calls) == 2
-    assert c.stop_reason == "calibration is lost: it excludes the truth"
 
 
 # Surprises are uniform where the simulator is right, and small where it is not

@@ -58,7 +58,7 @@ def forked(words, place="", **options):
 def forget(folder, content=None):
     """Have a folder's summary be another one, or none."""
     with contextlib.closing(Store(folder, "campaign")) as store, store.writing():
-        store.put(SUMMARY, 0, content or b"{}")
+        store.put(SUMMARY, content or b"{}")
 
 
 def read(text):

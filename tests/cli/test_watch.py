@@ -5,9 +5,11 @@ import re
 import signal
 import socket
 import subprocess
+import sys
 import threading
 import time
 from contextlib import contextmanager, suppress
+from pathlib import Path
 from urllib.error import HTTPError
 from urllib.request import Request, urlopen
 
@@ -18,7 +20,10 @@ from sbi_active.campaign.watch import server_of
 from sbi_active.cli import main
 from tests.cli.sled import run
 from tests.display.browser import assert_reads_well
+from tests.display.driver import browser
 from tests.simulation.bank.filled import execute
+
+ROOT = Path(__file__).parents[2]
 
 
 def ask(url, path="/", **headers):
@@ -61,7 +66,7 @@ def test_the_page_follows_a_campaign_of_another_process(camp, tmp_path):
     said = process.stdout.readline()
     place = re.fullmatch(r"open (http://127\.0\.0\.1:\d+), until Ctrl-C\n", said)
     assert place is not None, said
-    page = wait_for("1 trials told; trial 1 is pending", place[1])
+    page = wait_for("1 trial told; trial 1 is pending", place[1])
     state = json.loads(ask(place[1], "/state"))
     assert state["doing"] == "trial 1 waits for its outcome"
     assert f'now.seal !== "{state["seal"]}"' in page  # else it is loaded again
@@ -70,11 +75,55 @@ def test_the_page_follows_a_campaign_of_another_process(camp, tmp_path):
     assert main(["tell", "camp", "0.7"]) == 0
     assert json.loads(ask(place[1], "/state"))["seal"] != state["seal"]
     page = wait_for("2 trials told", place[1])
-    assert_reads_well(page, tmp_path)
+    assert_reads_well(page.replace("\nfollow();", ""), tmp_path)  # nobody answers there
     process.send_signal(signal.SIGINT)
     _, error = process.communicate(timeout=60)
     assert process.returncode == 130
     assert error == "sbi-active: interrupted; what was told before is kept\n"
+
+
+ROUNDS = """
+import sys
+from tests.campaign.storage.campaigns import go_on, new
+campaign = new(sys.argv[1])
+for num in range(1, 4):
+    input()
+    go_on(campaign, num)
+input()
+campaign.ask()
+campaign.close()
+"""
+
+
+def test_a_browser_sees_rounds_of_another_process_come_in(tmp_path):
+    folder = tmp_path / "c"
+
+    def goes_on():
+        print(file=process.stdin, flush=True)
+
+    with browser(tmp_path) as seen:
+        process = subprocess.Popen(
+            [sys.executable, "-c", ROUNDS, str(folder)],
+            cwd=ROOT,
+            stdin=subprocess.PIPE,
+            text=True,
+        )
+        while not (folder / "campaign.toml").exists():
+            assert process.poll() is None
+            time.sleep(0.1)
+        with watched(folder) as url:
+            seen.open(url)
+            told = []
+            for num in range(1, 4):  # nothing is clicked
+                goes_on()
+                told.append(seen.wait_for(f"{num} trial{'s' * (num > 1)} told"))
+            goes_on()
+            seen.wait_for("trial 3 waits for its outcome")
+            assert seen.run("return document.images[0].naturalWidth") > 300
+        seen.wait_for("does not answer")
+    assert process.wait(timeout=60) == 0
+    assert ["a process has it open" in page for page in told] == [True] * 3
+    assert len(Campaign.load(folder).history) == 3
 
 
 def test_what_is_going_on_is_said(camp):
@@ -107,7 +156,7 @@ def test_nothing_else_is_answered(camp):
         # A site whose name was made to lead here is not told anything.
         assert refused(url, Host="evil.example")[0] == 404
         assert refused(url, "/state", Host=f"127.0.0.1.evil.example:{port}")[0] == 404
-        assert "1 trials told" in ask(url, Host="localhost:8000")  # through a tunnel
+        assert "1 trial told" in ask(url, Host="localhost:8000")  # through a tunnel
         with suppress(OSError), socket.create_connection((own_address(), port), 1):
             raise AssertionError("others on the network are answered")
 
@@ -120,8 +169,8 @@ def own_address():
 
 def test_a_file_that_is_damaged_meanwhile_is_said(camp):
     with watched(camp) as url:
-        assert "1 trials told" in ask(url)
-        execute(camp, "UPDATE records SET head_digest = x'00' WHERE kind = 'log'")
+        assert "1 trial told" in ask(url)
+        execute(camp, "UPDATE records SET digest = x'00' WHERE kind = 'log'")
         status, text = refused(url)
         assert status == 503
         assert "with another checksum" in text

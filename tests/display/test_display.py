@@ -3,7 +3,7 @@
 import re
 from dataclasses import replace
 
-import matplotlib
+import matplotlib.pyplot
 import pandas as pd
 import pytest
 import torch
@@ -19,6 +19,7 @@ from sbi_active import (
 from sbi_active.campaign.display.page import page as campaign_page
 from sbi_active.campaign.display.page import write_page
 from sbi_active.display import Page, Section, Table
+from sbi_active.display.figures import legible
 from sbi_active.display.notebook import badge, card, facts, items, table
 from tests.campaign.storage.campaigns import MODEL, OPTIONS, PRIOR, go_on, new, outcome
 from tests.criticism.report.reports import report
@@ -222,3 +223,15 @@ def test_a_campaign_reads_well_in_a_browser(tmp_path):
     assert_reads_well(made, tmp_path)
     assert "2 trials told" in made
     assert made.count("<td>") >= 2 * len(campaign.history)
+
+
+def test_ticks_of_a_logarithm_are_numbers():
+    figure, (left, right) = matplotlib.pyplot.subplots(1, 2)
+    left.set(yscale="log", ylim=(1e-3, 1e3))
+    right.set_yscale("symlog", linthresh=2)
+    right.set_ylim(-100, 100)
+    legible(figure).canvas.draw()
+    texts = [text.get_text() for ax in (left, right) for text in ax.get_yticklabels()]
+    assert {"0.01", "1", "\N{MINUS SIGN}10"} <= {*texts}
+    assert "$" not in "".join(texts)
+    matplotlib.pyplot.close(figure)

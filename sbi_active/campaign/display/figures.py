@@ -180,7 +180,7 @@ def _draw_actions(ax: Axes, campaign: Any) -> None:
         return
     from matplotlib import colormaps
 
-    colors = colormaps["viridis"](np.linspace(0, 0.9, len(designed)))
+    colors = colormaps["viridis"](np.linspace(0.1, 0.75, len(designed)))
     for trial, color in zip(designed, colors, strict=True):
         design = trial.design
         place, gain = design.candidates[:, 0], design.expected_information_gain

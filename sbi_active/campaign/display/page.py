@@ -208,7 +208,8 @@ def _summary(campaign: Any) -> str:
     late = f"; not in the belief yet: {waiting}" if waiting else ""
     pending = campaign.pending
     asked = "" if pending is None else f"; trial {pending.index} is pending"
-    return f"{len(campaign.history)} trials told{asked}{late}"
+    told = len(campaign.history)
+    return f"{told} trial{'s' * (told != 1)} told{asked}{late}"
 
 
 def _in_words(campaign: Any, known: Table) -> str:

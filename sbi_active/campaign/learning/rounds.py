@@ -107,7 +107,7 @@ class Round:
         if key == 0 and theta is drawn and not learner.has_index:
             store = find_store(simulator)
             if isinstance(store, Bank):  # so that :func:`.reuse` can weight the rows
-                store = store.drawn_from(learner.belief, label="prior")
+                store = store.drawn_from(learner.belief)
         workers = state.options.workers
         rows = simulate(
             simulator, theta, action, seed=own, workers=workers, store=store

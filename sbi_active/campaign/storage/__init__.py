@@ -3,7 +3,3 @@
 This package contains the records, their checks, and the way to read them. It does not
 infer or design.
 """
-
-from sbi_active.renamed import former_names
-
-__getattr__ = former_names(__name__)

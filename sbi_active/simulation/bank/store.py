@@ -4,18 +4,19 @@ It is one SQLite file, which may come from anybody: nothing in it is executed. I
 is compared with that of a store before anything is read from it, no journal is played
 back that none leaves, and no link is followed.
 
-A record has a kind, a number, a head and a body, which is read apart: that of rows is
-what they measure. Records of a series are numbered from 1, and a catalog says which
-there are. Checksums cover kind, number and the file's own name, so that bytes that were
-changed, exchanged, lost or come from elsewhere are noticed: SQLite itself has checksums
-of its log alone.
+A record has a kind, a number and a content. Records of a series are numbered from 1,
+and a catalog says which there are. Checksums cover kind, number and the file's own
+name, so that bytes that were changed, exchanged, lost or come from elsewhere are
+noticed: SQLite itself has checksums of its log alone.
 """
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import json
 import os
+import re
 import secrets
 import sqlite3
 import stat
@@ -28,24 +29,75 @@ from typing import Any
 from urllib.parse import quote
 
 from sbi_active.expected import require
-from sbi_active.simulation.bank.errors import sensible, whole
+from sbi_active.messages import Explained
 
-NAME, FORMAT = "store.db", 3  # format 1 was folders of HDF5, 2 had three tables
+NAME, FORMAT = "store.db", 4  # format 1 was folders of HDF5
 LOCK = "store.lock"  # empty: who writes holds SQLite's lock on it
 TEMPORARY = ".writing-"
 CATALOG = "catalog"  # the last number of each kind
-#: Digests stand before the body, whose pages are then read only for the body.
+#: The digest stands before the content, whose pages are then read only for it.
 SCHEMA = (
-    "CREATE TABLE records (kind TEXT NOT NULL, number INTEGER NOT NULL, head BLOB NOT "
-    "NULL, head_digest BLOB NOT NULL, body_digest BLOB NOT NULL, body BLOB NOT NULL, "
-    "PRIMARY KEY (kind, number))"
+    "CREATE TABLE records (kind TEXT NOT NULL, number INTEGER NOT NULL, digest BLOB "
+    "NOT NULL, content BLOB NOT NULL, PRIMARY KEY (kind, number))"
 )
-SETTINGS = ("trusted_schema = OFF", "cell_size_check = ON", "journal_mode = WAL")
-SETTINGS += ("synchronous = FULL", "secure_delete = OFF")
-SETTINGS += (f"journal_size_limit = {64 * 2**20}",)
+SETTINGS = (
+    "PRAGMA trusted_schema = OFF; PRAGMA cell_size_check = ON; "
+    "PRAGMA journal_mode = WAL; PRAGMA synchronous = FULL; BEGIN"
+)
 #: Seconds to wait for a moment in which another process tidies up. A choice.
 PATIENCE = 10.0
 OTHERWISE = "or bring what is there from before up to date by: sbi-active migrate"
+
+#: SQLite's errors that say nothing against the file.
+OF_THE_DISK = re.compile("locked|full|readonly|disk I/O|unable to open|too big")
+
+
+class CorruptSegmentError(Explained, OSError):
+    """A file of a bank or campaign that does not hold what was written to it."""
+
+    code = "SA605"
+
+
+class LockedError(Explained, OSError):
+    """Somebody else is writing."""
+
+    code = "SA608"
+
+
+class LogChangedError(Explained, ValueError):
+    """Another writer added to a campaign since it was loaded here."""
+
+    code = "SA607"
+
+
+def whole(path: Path, holds: bool, reason: str) -> None:
+    """Raise a CorruptSegmentError, with a reason, unless something holds of a file."""
+    if not holds:
+        text = f"expected {path} as it was written; got {reason}"
+        raise CorruptSegmentError(f"{text}; restore it from a copy")
+
+
+@contextmanager
+def sensible(path: Path) -> Iterator[None]:
+    """Turn errors of SQLite, and of content without sense, into this library's."""
+    try:
+        yield
+    except (OSError, LogChangedError):
+        raise
+    except Exception as error:  # what a crafted file leads to has no end
+        text = f"{type(error).__name__}: {error!s:.200}"
+        of_disk = isinstance(error, sqlite3.Error) and bool(OF_THE_DISK.search(text))
+        whole(path, of_disk, f"content that leads to {text}")
+        if "locked" in text:
+            other = f"expected no other writer of {path.parent}; got one"
+            raise LockedError(f"{other}; wait, or call close() there") from error
+        raise OSError(
+            errno.ENOSPC if "full" in text else errno.EIO,
+            f"expected to read and write; got {text!r}; make room or choose a place "
+            "that can be written, and run again: what was stored before is whole",
+            str(path),
+        ) from error
+
 
 #: One thread at a time reads or writes, and none while the process forks.
 _GUARD = threading.RLock()
@@ -77,26 +129,16 @@ class Store:
         self.folder, self.path, self._what = folder, folder / NAME, what
         self._connection: Any = None
         self._lock: Any = None
-        self._catalog: dict[str, int] | None = None  # in a transaction
         with _GUARD:
             _STORES.add(self)
         if make and not os.path.lexists(self.path):
-            try:
-                self._make()
-            except OSError:  # unless somebody was faster, and tidied up
-                if not self.path.exists():
-                    raise
+            self._make()
         with self.reading():
             pass
 
     def __del__(self) -> None:
         with suppress(Exception):
             self.close()
-
-    @property
-    def held(self) -> bool:
-        """Whether this object has the right to write, in this process."""
-        return self._lock is not None
 
     @contextmanager
     def reading(self) -> Iterator[Any]:
@@ -115,35 +157,42 @@ class Store:
                     self._open()
                 with sensible(self.path):
                     yield self._connection
-                keeps = self.held
+                keeps = self._lock is not None
             finally:
                 if opens and not keeps:
                     self._drop("_connection")
 
     @contextmanager
-    def writing(self) -> Iterator[None]:
+    def writing(self, series: str = "", length: int = 0) -> Iterator[None]:
         """Write all that is put in the block, or nothing; on the disk at its end.
+
+        Args:
+            series: Series that this is written after, if any.
+            length: Number of its records, as they are known here.
 
         Raises:
             LockedError: If somebody else has the right to write.
+            LogChangedError: If the series has another length; nothing is written.
             OSError: If the disk is full or cannot be written.
         """
         with _GUARD:
             self.acquire()
             with self.reading() as connection:
-                is_left = self._state() == self._left
+                is_left = self.seal() == self._left
                 whole(self.path, is_left, "another file; nothing was written to it now")
                 connection.execute("BEGIN IMMEDIATE")
                 try:
-                    before = self._catalog = self.catalog
+                    if series and self.catalog.get(series, 0) != length:
+                        self._drop("_lock")  # others may go on
+                        raise LogChangedError(
+                            f"expected {self.folder} as it was loaded; got trials that "
+                            "another process told since; load it again, and tell anew"
+                        )
                     yield
-                    if self._catalog != before:
-                        self.put(CATALOG, 0, self._catalog)
                     connection.commit()
                 finally:
-                    self._catalog = None
                     connection.rollback()  # of what was not committed
-                self._left = self._state()
+                    self._left = self.seal()
 
     def acquire(self) -> None:
         """Take the right to write, which ends with :meth:`close` or the process.
@@ -153,36 +202,28 @@ class Store:
             OSError: If the folder cannot be written.
         """
         with _GUARD, sensible(self.folder / LOCK):
-            if self.held:
+            if self._lock is not None:
                 return
-            self._lock = _connected(self.folder / LOCK, "rwc", timeout=0.1)
-            try:
-                self._lock.execute("PRAGMA journal_mode = MEMORY")  # nothing is written
-                self._lock.execute("BEGIN EXCLUSIVE")
-            except BaseException:
-                self._drop("_lock")
-                raise
-            for left in self.folder.glob(f"{TEMPORARY}*{NAME}*"):  # by the killed
-                left.unlink(missing_ok=True)
+            lock = _connected(self.folder / LOCK, "rwc", timeout=0.1)
+            lock.execute("PRAGMA journal_mode = MEMORY")  # nothing is written
+            lock.execute("BEGIN EXCLUSIVE")
+            self._lock = lock
 
     def close(self) -> None:
         """Let others write. The next call opens the file again."""
         with _GUARD:
-            if self._connection is not None:
-                with suppress(sqlite3.Error):  # a full disk must not keep the lock
-                    self._connection.execute("PRAGMA wal_checkpoint(TRUNCATE)")
             self._drop("_connection", "_lock")
 
-    def get(self, kind: str, number: int = 0, *, part: str = "head") -> bytes | None:
-        """Return the head or the body of a record; None if there is none."""
-        read = f"SELECT {part}, {part}_digest FROM records WHERE kind = ? AND number ="
+    def get(self, kind: str, number: int = 0) -> bytes | None:
+        """Return the content of a record; None if there is none."""
+        read = "SELECT content, digest FROM records WHERE kind = ? AND number = ?"
         with self.reading() as connection:
-            found = connection.execute(f"{read} ?", (kind, number)).fetchone()
+            found = connection.execute(read, (kind, number)).fetchone()
             if found is None:
                 listed = kind == CATALOG or number <= self.catalog.get(kind, -1)
                 whole(self.path, not listed, f"no {kind!r} {number}: a gap")
                 return None
-            same = found[1] == _digest(self._id, part, kind, number, found[0])
+            same = found[1] == _digest(self._id, kind, number, found[0])
             whole(self.path, same, f"{kind!r} {number} with another checksum")
             return found[0]
 
@@ -195,42 +236,30 @@ class Store:
     @property
     def catalog(self) -> dict[str, int]:
         """The last number of each kind."""
-        if self._catalog is not None:  # as it will be written
-            return self._catalog
-        found = self.json(CATALOG) or {}
-        own = all(type(number) is int for number in found.values())
-        whole(self.path, own, "a catalog that none writes")
-        return found
+        return self.json(CATALOG) or {}
 
-    def length(self, series: str) -> int:
-        """Return the number of records of a series."""
-        return self.catalog.get(series, 0)
+    def seal(self, *ends: str) -> str:
+        """Return a text that changes if the file does, or those of other endings."""
+        files = [self.path.with_name(f"{NAME}{end}") for end in ("", *ends)]
+        states = [os.stat(file) for file in files if file.exists()]
+        return str([(s.st_ino, s.st_size, s.st_mtime_ns) for s in states])
 
-    def seal(self, *kinds: str) -> str:
-        """Return a text that changes with the last record of each of some kinds."""
-        read = "SELECT max(number), head_digest FROM records WHERE kind = ?"
-        with self.reading() as connection:
-            last = [connection.execute(read, (k,)).fetchone() for k in kinds]
-        return hashlib.sha256(repr(last).encode()).hexdigest()
-
-    def put(self, kind: str, number: int, head: Any, body: Any = b"") -> None:
+    def put(self, kind: str, content: Any, number: int = 0) -> None:
         """Write a record in place of another; for use in :meth:`writing`.
 
         Args:
             kind: Kind of the record.
+            content: Bytes, or JSON data.
             number: Number of the record; 0 of one that is no series.
-            head: Bytes, or JSON data.
-            body: Bytes.
         """
-        if kind != CATALOG and number > self.catalog.get(kind, -1):
-            self._catalog = {**self.catalog, kind: number}
-        _insert(self._connection, self._id, kind, number, head, body)
+        catalog = self.catalog
+        if number > catalog.get(kind, -1):
+            _insert(self._connection, self._id, CATALOG, 0, {**catalog, kind: number})
+        _insert(self._connection, self._id, kind, number, content)
 
-    def append(self, series: str, head: Any, body: Any = b"") -> int:
-        """Write the next record of a series, in :meth:`writing`; return its number."""
-        number = self.length(series) + 1
-        self.put(series, number, head, body)
-        return number
+    def append(self, series: str, content: Any) -> None:
+        """Write the next record of a series, in :meth:`writing`."""
+        self.put(series, content, self.catalog.get(series, 0) + 1)
 
     def verify(self) -> None:
         """Read every byte of the file.
@@ -244,61 +273,49 @@ class Store:
             for kind, last in self.catalog.items():
                 for number in range(min(last, 1), last + 1):
                     self.get(kind, number)
-                    self.get(kind, number, part="body")
 
     def _make(self) -> None:
         """Make the file in a folder of its own, which is made where there is none."""
-        folder, own = self.folder, (".", NAME, LOCK)  # of writers that were killed
+        folder, known = self.folder, (".", NAME, LOCK)  # of writers that were killed
         folder.mkdir(parents=True, exist_ok=True)
-        other = sorted(p.name for p in folder.iterdir() if not p.name.startswith(own))
+        other = sorted(p.name for p in folder.iterdir() if not p.name.startswith(known))
         expected, got = f"an empty folder for a {self._what}", f"{folder} with {other}"
         require(not other, expected, got, f"choose another folder, {OTHERWISE}")
         fresh, name = folder / f"{TEMPORARY}{os.getpid()}-{NAME}", secrets.randbits(31)
         fresh.unlink(missing_ok=True)
         made = sqlite3.connect(fresh, isolation_level=None)
         with sensible(fresh), closing(made):
-            for setting in (f"user_version = {FORMAT}", f"application_id = {name}"):
-                made.execute(f"PRAGMA {setting}")
-            made.execute("PRAGMA journal_mode = WAL")
-            made.execute(SCHEMA)
-            _insert(made, name, CATALOG, 0, {}, b"")
+            own = f"PRAGMA user_version = {FORMAT}; PRAGMA application_id = {name}"
+            made.executescript(f"PRAGMA journal_mode = WAL; {own}; {SCHEMA}")
+            _insert(made, name, CATALOG, 0, {})
         if not self.path.exists():  # nobody was faster
             os.replace(fresh, self.path)
             synchronize(folder)
 
     def _open(self) -> None:
         """Open the file, whose table must be that of a store."""
-        path, expected, got = self.path, f"a {self._what}", f"no {self.path}"
-        make = "give simulator= or directory=, or run sbi-active init, to make one"
-        advice = f"{make}, {OTHERWISE}"
-        require(os.path.lexists(path), expected, got, advice)
+        path, make = self.path, "give simulator= or directory=, or run sbi-active init"
+        advice = f"{make}, to make one, {OTHERWISE}"
+        require(os.path.lexists(path), f"a {self._what}", f"no {path}", advice)
         # Where no notes of a reader can be written, or would be another user's and keep
         # the owner from writing, the file is read as it is.
         is_still = not all(os.access(p, os.W_OK) for p in (path, path.parent))
         is_still &= not path.with_name(f"{NAME}-wal").exists()
         mode = "ro&immutable=1" if is_still else "rw"
         self._connection = _connected(path, mode, timeout=PATIENCE)
-        whole(path, path.stat().st_size > 0, "an empty file")
         execute = self._connection.execute
         with sensible(path):
-            for setting in SETTINGS:
-                execute(f"PRAGMA {setting}")
-            execute("BEGIN")
+            self._connection.executescript(SETTINGS)
             form = execute("PRAGMA user_version").fetchone()[0]
             self._id = execute("PRAGMA application_id").fetchone()[0]
             tables = execute("SELECT sql FROM sqlite_master").fetchall()
-            if self.held:
+            if self._lock is not None:
                 execute("COMMIT")
-        expected, got = f"{expected} of format {FORMAT}", f"{form} in {path}"
+        expected, got = f"a {self._what} of format {FORMAT}", f"{form} in {path}"
         require(form == FORMAT, expected, got, "use the release that wrote it")
         is_own = tables == [(SCHEMA,), (None,)]  # the table, and the index of its key
         whole(path, is_own, "tables that are not those of a store")
-        self._left = self._state()
-
-    def _state(self) -> Any:
-        """Return a value that changes if the file is another one, or is changed."""
-        state = self.path.stat() if self.path.exists() else None
-        return state and (state.st_ino, state.st_size, state.st_mtime_ns)
+        self._left = self.seal()
 
     def _drop(self, *names: str) -> None:
         """Close the connection to the file, or the lock, where it is held."""
@@ -344,19 +361,17 @@ def _connected(path: Path, mode: str, *, timeout: float) -> sqlite3.Connection:
     return sqlite3.connect(place, uri=True, timeout=timeout, **how)
 
 
-def _insert(at: Any, name: int, kind: str, number: int, head: Any, body: Any) -> None:
-    """Write a record with its digests, in a store of a name."""
-    if isinstance(head, dict):
-        head = json.dumps(head, allow_nan=False).encode()
-    parts = {"head": head, "body": body}
-    digests = [_digest(name, part, kind, number, c) for part, c in parts.items()]
-    row = (kind, number, head, *digests, body)
-    at.execute("INSERT OR REPLACE INTO records VALUES (?, ?, ?, ?, ?, ?)", row)
+def _insert(at: Any, name: int, kind: str, number: int, content: Any) -> None:
+    """Write a record with its digest, in a store of a name."""
+    if isinstance(content, dict):
+        content = json.dumps(content, allow_nan=False).encode()
+    row = (kind, number, _digest(name, kind, number, content), content)
+    at.execute("INSERT OR REPLACE INTO records VALUES (?, ?, ?, ?)", row)
 
 
-def _digest(name: int, part: str, kind: str, number: int, content: bytes) -> bytes:
-    """Return the checksum of a part of a record, in a store of a name."""
-    digest = hashlib.sha256(f"{name} {part} {kind} {number} ".encode())
+def _digest(name: int, kind: str, number: int, content: bytes) -> bytes:
+    """Return the checksum of a record, in a store of a name."""
+    digest = hashlib.sha256(f"{name} {kind} {number} ".encode())
     digest.update(content)
     return digest.digest()
 

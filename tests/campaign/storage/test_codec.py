@@ -1,14 +1,18 @@
 """Objects as data and back: the same numbers, and no code but ours."""
 
-import json
+import os
+import pickle
 import zlib
 from io import BytesIO
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
 
+from sbi_active.campaign.storage import codec
 from sbi_active.campaign.storage.codec import Absent, NotStorableError, decode, encode
+from sbi_active.campaign.storage.directory import Storage
 from sbi_active.design import Design
 
 
@@ -33,8 +37,11 @@ def test_what_is_known_is_referred_to():
         return theta
 
     assert back([simulator], simulator=simulator)[0] is simulator
-    holder = {"inner": [simulator]}
+    holder = Foreign()
+    holder.inner = simulator
     assert back(simulator, holder=holder) is simulator
+    within = encode(simulator, known={"holder": holder})
+    assert isinstance(decode(within, known={"holder": Absent()}), Absent)
     content = encode([simulator], known={"simulator": simulator})
     absent = Absent()
     assert decode(content, known={"simulator": absent})[0] is absent
@@ -54,19 +61,47 @@ def test_only_classes_of_trusted_packages():
     )
     assert design.num_simulations == 3
     for name in ("os:system", "subprocess:Popen", "sbi_active.cli.__main__:main"):
-        content = written({"!": "object", "class": name, "state": []})
-        with pytest.raises(ValueError, match="no class"):
-            decode(content, known={})
+        with pytest.raises(ValueError, match="not a type object"):
+            decode(written(Called(codec.made, name, {})), known={})
 
 
-def written(structure):
+class Called:
+    """What a file may have called while it is read, with whatever arguments."""
+
+    def __init__(self, function, *arguments):
+        self.called = function, arguments
+
+    def __reduce__(self):
+        return self.called
+
+
+def written(value):
     buffer = BytesIO()
-    torch.save({"structure": json.dumps(structure), "arrays": []}, buffer)
+    module = SimpleNamespace(Pickler=pickle.Pickler, __name__="pickle")
+    torch.save(value, buffer, pickle_module=module)
     return zlib.compress(buffer.getvalue())
+
+
+def test_a_file_has_nothing_else_called(tmp_path):
+    place = tmp_path / "made"
+    for function, *arguments in (
+        (os.mkdir, str(place)),
+        (exec, f"import os; os.mkdir({str(place)!r})"),
+        (Storage, str(place)),
+        (codec.decode, b"", {}),
+        (codec.given, "simulator", ""),
+        (codec.made, "sbi_active.campaign.options:CampaignOptions", 7),
+        (getattr, "a", "join"),
+    ):
+        with pytest.raises(ValueError, match="expected what this library stores"):
+            decode(written(Called(function, *arguments)), known={})
+        assert not place.exists()
+    with pytest.raises(ValueError, match="expected what this library stores"):
+        decode(written(torch.distributions.Normal(0.0, 1.0)), known={})
 
 
 def test_fields_that_came_later_have_their_defaults():
     kind = "sbi_active.campaign.state:Trial"
-    old = {"!": "object", "class": kind, "state": [["index", 3], ["action", None]]}
+    old = Called(codec.made, kind, {"index": 3, "action": None})
     trial = decode(written(old), known={})
     assert (trial.index, trial.status, trial.seconds) == (3, "pending", {})

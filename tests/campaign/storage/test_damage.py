@@ -19,7 +19,7 @@ from sbi_active.messages import StorageWarning
 from sbi_active.simulation.bank import CorruptSegmentError
 from sbi_active.simulation.bank.store import Store
 from tests.campaign.storage.campaigns import MODEL, PRIOR, draws, facts, go_on, new
-from tests.simulation.bank.filled import crafted, execute, flip
+from tests.simulation.bank.filled import crafted, execute, filled, flip
 
 if sys.version_info >= (3, 11):
     pass
@@ -48,7 +48,7 @@ def line(folder, number):
     """Return the place of a line of the log in the file, and its bytes."""
     execute(folder, "VACUUM")  # no page of before holds the line as well
     ((text,),) = execute(
-        folder, "SELECT head FROM records WHERE kind = 'log' AND number = ?", number
+        folder, "SELECT content FROM records WHERE kind = 'log' AND number = ?", number
     )
     return (folder / FILE).read_bytes().index(text), text
 
@@ -60,7 +60,8 @@ def flip_line(folder, number, share=0.5):
 
 def test_what_was_not_committed_is_not_there(made, folder):
     with Campaign.load(folder, simulator=MODEL) as campaign:
-        campaign._storage.acquire()
+        with campaign._storage.writing():
+            pass
         campaign.tell([0.1, 0.2, 0.3, 0.4])
         log = (folder / "store.db-wal").read_bytes()
         before = (folder / FILE).read_bytes()
@@ -91,7 +92,7 @@ def test_a_damaged_line_is_named_and_the_others_can_be_read(made, folder):
     flip_line(folder, 2)  # the first tell
     with pytest.raises(CorruptSegmentError, match="'log' 2 with .*from a copy"):
         Campaign.load(folder)
-    kept = execute(folder, "SELECT head FROM records WHERE kind = 'log'")
+    kept = execute(folder, "SELECT content FROM records WHERE kind = 'log'")
     told = [json.loads(text) for (text,) in kept[2:]]
     assert told[-2]["trial"]["x"] == made[1].history[1].x.tolist()
 
@@ -99,8 +100,8 @@ def test_a_damaged_line_is_named_and_the_others_can_be_read(made, folder):
 @pytest.mark.parametrize("name", ["state", "belief"])
 def test_what_can_be_computed_again_is(made, folder, name):
     for change in (
-        "UPDATE records SET head = x'00' WHERE kind = ?",
-        "UPDATE records SET head_digest = x'00' WHERE kind = ?",
+        "UPDATE records SET content = x'00' WHERE kind = ?",
+        "UPDATE records SET digest = x'00' WHERE kind = ?",
         "DELETE FROM records WHERE kind = ?",
     ):
         execute(folder, change, name)
@@ -116,7 +117,7 @@ def test_a_belief_of_other_code_is_computed_again(made, folder):
     with store.writing():
         belief = decode(store.get("belief"), known=known)
         del belief._defensive  # what it was called when it was stored
-        store.put("belief", 0, encode(belief, known=known))
+        store.put("belief", encode(belief, known=known))
     store.close()
     campaign = Campaign.load(folder, simulator=MODEL)
     with pytest.warns(StorageWarning, match="computed again.*SA601"):
@@ -126,17 +127,17 @@ def test_a_belief_of_other_code_is_computed_again(made, folder):
 
 
 def test_a_damaged_manifest_is_named(folder):
-    execute(folder, "UPDATE records SET head = x'00' WHERE kind = 'campaign'")
+    execute(folder, "UPDATE records SET content = x'00' WHERE kind = 'campaign'")
     with pytest.raises(CorruptSegmentError, match="'campaign' 0 with another checksum"):
         Campaign.load(folder)
 
 
-def test_another_schema_names_the_release(folder):
-    manifest = {**Campaign.load(folder)._storage.manifest, "schema": 9}
-    manifest["packages"]["sbi-active"] = "9.9"
-    crafted(folder, "campaign", 0, manifest)
-    with pytest.raises(ValueError, match=r"schema 3; got 9 .*9\.9"):
+def test_another_format_or_a_bank_is_no_campaign(folder, tmp_path):
+    execute(folder, "PRAGMA user_version = 99")
+    with pytest.raises(ValueError, match="a campaign of format 4; got 99 .*release"):
         Campaign.load(folder)
+    with pytest.raises(ValueError, match="expected a campaign; got a bank"):
+        Campaign.load(filled(tmp_path / "bank"))
 
 
 class Bomb:
@@ -161,7 +162,7 @@ def test_nothing_is_executed(short, tmp_path, kind, number):
     for content in (
         pickle.dumps(Bomb()),
         zlib.compress(pickle.dumps(Bomb())),
-        zlib.compress(_saved({"structure": "{}", "arrays": Bomb()})),
+        zlib.compress(_saved({"lines": Bomb()})),
     ):
         crafted(folder, kind, number, content)
         with contextlib.suppress(ValueError, OSError):
@@ -189,7 +190,8 @@ def test_a_full_disk_refuses_and_loses_nothing(made, folder):
 
         signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
         campaign = Campaign.load(folder, simulator=MODEL)
-        campaign._storage.acquire()
+        with campaign._storage.writing():
+            pass
         log = (folder / "store.db-wal").stat().st_size
         resource.setrlimit(resource.RLIMIT_FSIZE, (log + 50, log + 50))
         try:

@@ -1,15 +1,16 @@
 """Campaigns that go on from their directory, as if they had never been left."""
 
+import copy
 import pickle
-from dataclasses import replace
 
 import pytest
 import torch
 from torch.distributions import Uniform
 
-from sbi_active import BoxActions, Campaign
+from sbi_active import Bank, BoxActions, Campaign, SimulatorModel
+from sbi_active.campaign.storage.directory import is_mean
 from sbi_active.simulation import reuse
-from sbi_active.simulation.bank import Bank, LockedError
+from sbi_active.simulation.bank import LockedError
 from tests.campaign.storage.campaigns import (
     ACTIONS,
     MODEL,
@@ -212,7 +213,7 @@ def test_what_only_its_author_can_make_is_asked_for(tmp_path):
         Campaign.load(tmp_path / "c")
     reader = Campaign.load(tmp_path / "c", prior=prior)
     assert torch.equal(draws(reader), draws(campaign))
-    with pytest.raises(ValueError, match="expected cost= as declared; got none"):
+    with pytest.raises(ValueError, match=r"limits .*\['cost'\]; got \[\]"):
         Campaign.load(tmp_path / "c", simulator=MODEL, prior=prior)
     again = Campaign.load(tmp_path / "c", simulator=MODEL, prior=prior, cost=price)
     assert torch.equal(draws(again), draws(campaign))
@@ -259,22 +260,22 @@ def test_adopted_effects_come_back(tmp_path):
     assert again.history[-1].version == 1
 
 
-def test_a_bank_that_campaigns_share(tmp_path):
-    options = replace(OPTIONS, bank=tmp_path / "bank")
+def test_rows_of_a_campaign_are_used_again(tmp_path):
+    with new(tmp_path / "c", simulator=counted, method="asbi") as campaign:
+        assert campaign.posterior is not None  # the first round's network
+    worth = reuse(Bank(tmp_path / "c", name="drawn"), PRIOR).effective_sample_size
+    assert worth == pytest.approx(OPTIONS.num_simulations)
 
-    def num_simulated(seed):
-        CALLS.clear()
-        with new(simulator=counted, method="asbi", options=options, seed=seed) as found:
-            assert found.posterior is not None  # the first round's network
-        return sum(CALLS)
 
-    first = num_simulated(seed=0)
-    assert first >= OPTIONS.num_simulations
-    assert num_simulated(seed=0) < first / 5
-    assert num_simulated(seed=1) >= OPTIONS.num_simulations
-    bank = Bank(tmp_path / "bank", name="drawn")
-    worth = reuse(bank, PRIOR).effective_sample_size
-    assert worth == pytest.approx(2 * OPTIONS.num_simulations)
+def test_rows_are_kept_of_a_simulator_and_of_its_mean_alone():
+    mean = copy.copy(MODEL)
+    mean.noise = None
+    assert is_mean(mean, MODEL)
+    assert not is_mean(drawn, MODEL)
+    drifting = SimulatorModel(drawn)
+    later = copy.copy(drifting)
+    later.next_index = 3  # another simulator, with other rows
+    assert not is_mean(later, drifting)
 
 
 def test_a_pickled_copy_lives_in_memory(tmp_path):

@@ -9,9 +9,8 @@ import torch
 
 from sbi_active import Campaign, GaussianNoise, SimulatorModel
 from sbi_active.campaign.storage.codec import decode, encode
-from sbi_active.campaign.storage.directory import LogChangedError
 from sbi_active.simulation.bank import CorruptSegmentError, store
-from sbi_active.simulation.bank.store import Store
+from sbi_active.simulation.bank.store import LogChangedError, Store
 from tests.campaign.storage.campaigns import facts, go_on, mean, new
 from tests.simulation.bank.filled import crafted, execute
 
@@ -177,9 +176,9 @@ def test_crafted_files_are_one_error_that_names_the_file(tmp_path):
     for key in manifest:
         spoil = SPOILS[rng.integers(len(SPOILS))]
         changes.append(("campaign", 0, {**manifest, key: spoil}))
-    for entry in whole.events:
-        line, trial = entry["line"], entry.get("trial", {})
-        for key in entry.keys() - {"line"}:
+    for line, entry in enumerate(whole.events, 1):
+        trial = entry.get("trial", {})
+        for key in entry:
             spoil = SPOILS[rng.integers(len(SPOILS))]
             changes.append(("log", line, {**entry, key: spoil}))
         for key in trial:

@@ -57,11 +57,10 @@ def test_what_is_to_be_done_is_said(old, capsys):
 
 
 def test_read(folder):
-    # What made its belief is gone: trials stay, and the belief is the prior until an
-    # update computes it again.
-    with pytest.warns(UserWarning, match="the belief has to be computed again"):
-        campaign = Campaign.load(folder)
+    # Its trials stay, and the belief is the prior until an update computes it again.
+    campaign = Campaign.load(folder)
     require_trials(campaign)
+    assert campaign.not_in_belief == [0, 1, 2]
     assert campaign.actions.units == ["m/s"]
     belief = campaign.belief
     assert belief.mean.tolist() == pytest.approx([0.5, 0.5], abs=0.02)
@@ -100,15 +99,16 @@ def test_gone_on_with_to_the_last_bit(folder):
 def test_what_was_simulated_is_there_row_by_row(folder):
     h5py = pytest.importorskip("h5py")
     bank = Bank(folder, name="drawn")
-    assert bank.verify() == []
-    columns = bank.columns("theta", "x", "index", "log_proposal")
+    bank.verify()
+    columns = {name: bank.table()[name] for name in ("theta", "index", "log_proposal")}
+    columns["x"] = bank.read().x.numpy()
     for name, column in columns.items():
         files = sorted(BANK.glob("segments/*.h5"))
         parts = []
         for path in files:
             with h5py.File(path) as file:
                 parts.append(file[name][()])
-        assert np.array_equal(np.concatenate(parts), column.numpy(), equal_nan=True)
+        assert np.array_equal(np.concatenate(parts), column, equal_nan=True)
     header = json.loads((BANK / "bank.json").read_text())
     assert bank.header["simulator"] == header["simulator"]
 
@@ -118,7 +118,7 @@ def test_a_bank_alone_and_several_in_a_folder(tmp_path):
     assert migrate(tmp_path / "bank") == {"rows": ROWS}
     assert len(Bank(tmp_path / "bank")) == ROWS
     with Bank(tmp_path / "bank", simulator=simulator) as bank:
-        assert bank.counts["ok"] == ROWS
+        assert (bank.table()["status"] == 0).sum() == ROWS
     for name in ("drawn", "noise-free"):
         shutil.copytree(BANK, tmp_path / "banks" / name)
     assert migrate(tmp_path / "banks") == {"drawn": ROWS, "noise-free": ROWS}
@@ -169,13 +169,3 @@ def test_without_h5py_it_says_what_to_install(old, monkeypatch):
     with pytest.raises(ImportError, match=r"pip install 'sbi-active\[migrate\]'"):
         migrate(old)
     assert not (old / "store.db").exists()
-
-
-def test_computed_again_from_its_log(folder):
-    from tests.simulation.bank.filled import execute
-
-    execute(folder, "DELETE FROM records WHERE kind IN ('state', 'belief')")
-    with Campaign.load(folder, simulator=simulator) as campaign:
-        campaign.update()
-        mean = campaign.belief.mean.tolist()
-        assert mean == pytest.approx([0.2913, 0.6018], abs=0.05)

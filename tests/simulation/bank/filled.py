@@ -8,6 +8,7 @@ import torch
 from sbi_active import Bank
 from sbi_active.simulation import Simulations
 from sbi_active.simulation.bank.store import Store
+from sbi_active.simulation.workers.store import run_digest
 
 FILE = "store.db"
 
@@ -20,11 +21,19 @@ def prior():
     return torch.distributions.MultivariateNormal(torch.zeros(2), torch.eye(2))
 
 
+def append(bank, rows, seed):
+    """Store rows that were simulated elsewhere, and return how many were new."""
+    before, columns = len(bank), {**vars(rows)}
+    run = run_digest(seed, columns["theta"], columns["action"])
+    bank.save(run, seed=seed, index=torch.arange(len(rows)), **columns)
+    return len(bank) - before
+
+
 def fill(bank, seeds=(0, 1, 2, 3), num=5):
     for seed in seeds:
         theta = torch.full((num, 2), float(seed))
         rows = Simulations(theta, theta[:, :1], theta)
-        bank.append(rows, seed=seed, proposal=prior(), label="prior")
+        append(bank.drawn_from(prior()), rows, seed)
 
 
 def appended(folder):
@@ -47,12 +56,11 @@ def execute(folder, statement, *values):
     return found
 
 
-def crafted(folder, kind, number, head, body=None):
+def crafted(folder, kind, number, content):
     """Put a record with the right checksum."""
     store = Store(folder)
     with store.writing():
-        before = store.get(kind, number, part="body")
-        store.put(kind, number, head, before if body is None else body)
+        store.put(kind, content, number)
     store.close()
 
 

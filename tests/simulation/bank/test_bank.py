@@ -11,6 +11,7 @@ from sbi_active.seeding import row_normals
 from sbi_active.simulation import Simulations
 from sbi_active.simulation.bank import LockedError
 from sbi_active.simulation.bank import bank as module
+from tests.simulation.bank.filled import append
 
 
 def simulator(theta, action, seeds):
@@ -62,7 +63,7 @@ def test_part_of_a_run_is_completed(bank):
     theta, action = draw(300)
     whole = simulate(simulator, theta, action, seed=0)
     with_store = simulate(simulator, theta, action, seed=0, store=bank)
-    run = bank._segments()[0][1]["run"]
+    run = bank._segments()[0][1]
     other = Bank(bank.path.parent / "other", simulator=simulator)
     some = torch.arange(0, 300, 7)
     rows = {k: getattr(whole, k)[some] for k in ("theta", "action", "x", "status")}
@@ -75,7 +76,7 @@ def test_part_of_a_run_is_completed(bank):
 def test_rows_by_position_slice_and_mask(bank, monkeypatch):
     monkeypatch.setattr(module, "SEGMENT_BYTES", 45 * 60)  # about 60 rows a segment
     rows = simulate(simulator, *draw(200), seed=0)
-    bank.append(rows, seed=0)
+    append(bank, rows, 0)
     assert len(bank._segments()) > 2
     some = torch.tensor([199, 3, 3, 70])
     assert torch.equal(bank.read(some).theta, rows.theta[some])
@@ -85,7 +86,7 @@ def test_rows_by_position_slice_and_mask(bank, monkeypatch):
     assert len(bank.read(slice(0, 0))) == 0
     assert torch.equal(bank.read([-1, 0]).x, rows.x[[-1, 0]])
     for bad in ([200], [-201], [0.5]):
-        with pytest.raises(ValueError, match=r"positions of rows within \[0, 200\)"):
+        with pytest.raises(IndexError):
             bank.read(bad)
 
 
@@ -95,17 +96,6 @@ def test_a_run_of_one_row_goes_on(bank):
     again = simulate(simulator, theta, action, seed=3, store=bank)
     assert same(first, again)
     assert len(bank) == 1
-
-
-def test_what_a_writer_that_died_left_is_removed(bank):
-    simulate(simulator, *draw(4), seed=0, store=bank)
-    bank.close()
-    (bank.path / ".writing-1-store.db").write_bytes(b"half")
-    with Bank(bank.path, simulator=simulator) as again:
-        simulate(simulator, *draw(4), seed=9, store=again)
-        assert len(again) == 8
-    names = sorted(p.name for p in bank.path.iterdir())
-    assert names == ["store.db", "store.lock"]
 
 
 def test_the_file_alone_holds_all_once_it_is_closed(bank, tmp_path):
@@ -122,7 +112,7 @@ def test_several_banks_in_one_file(tmp_path):
     with Bank(tmp_path, simulator=simulator, name="a") as bank:
         simulate(simulator, *draw(4), seed=0, store=bank)
     with Bank(tmp_path, simulator=draw, name="b") as other:
-        other.append(Simulations(*draw(3), torch.rand(3, 7)), seed=0)
+        append(other, Simulations(*draw(3), torch.rand(3, 7)), 0)
     assert [len(Bank(tmp_path, name=name)) for name in "ab"] == [4, 3]
     with pytest.raises(ValueError, match="expected the bank rows in .* bank a, bank b"):
         Bank(tmp_path)
@@ -132,10 +122,10 @@ def test_second_writer_is_told_who_writes_and_readers_go_on(bank):
     simulate(simulator, *draw(10), seed=0, store=bank)
     second = Bank(bank.path, simulator=simulator)
     with pytest.raises(LockedError, match="expected no other writer"):
-        second.append(SOME, seed=0)
+        append(second, SOME, 0)
     assert len(Bank(bank.path).read()) == 10
     bank.close()
-    second.append(SOME, seed=0)
+    append(second, SOME, 0)
     second.close()
 
 
@@ -144,7 +134,7 @@ def test_readers_go_on_while_another_process_writes(bank):
         own = Bank(bank.path, simulator=simulator)
         for seed in range(60):
             theta = torch.full((10, 1), float(seed))
-            own.append(Simulations(theta, theta, theta), seed=seed)
+            append(own, Simulations(theta, theta, theta), seed)
 
     lengths = []
     with forked(write) as is_running:
@@ -165,7 +155,7 @@ def test_a_reader_sees_one_state_of_the_file_at_a_time(bank):
     reader, rows = Bank(bank.path), simulate(simulator, *draw(10), seed=0)
     with reader._store.reading():
         assert len(reader) == 0
-        bank.append(rows, seed=0)
+        append(bank, rows, 0)
         assert len(reader) == 0
         assert reader._store.get("rows", 1) is None  # and is no gap
     assert len(reader) == 10
@@ -173,16 +163,16 @@ def test_a_reader_sees_one_state_of_the_file_at_a_time(bank):
 
 def test_shapes_set_by_another_writer_hold(bank):
     late = Bank(bank.path, simulator=simulator)
-    bank.append(Simulations(*draw(3), torch.rand(3, 3)), seed=0)
+    append(bank, Simulations(*draw(3), torch.rand(3, 3)), 0)
     bank.close()
     with late, pytest.raises(ValueError, match=r"'x': \[3\]}, as in the bank"):
-        late.append(Simulations(*draw(3), torch.rand(3, 4)), seed=1)
+        append(late, Simulations(*draw(3), torch.rand(3, 4)), 1)
 
 
 def test_the_lock_goes_with_its_process(bank):
     def hold():
         own = Bank(bank.path, simulator=simulator)
-        own.append(SOME, seed=0)
+        append(own, SOME, 0)
         time.sleep(60)
 
     with forked(hold) as is_running:
@@ -190,10 +180,10 @@ def test_the_lock_goes_with_its_process(bank):
         while not len(other):
             assert is_running()
         with pytest.raises(LockedError, match="expected no other writer"):
-            other.append(SOME, seed=0)
+            append(other, SOME, 0)
         os.kill(is_running.pid, signal.SIGKILL)
         assert is_running.join() == -signal.SIGKILL
-        other.append(SOME, seed=0)
+        append(other, SOME, 0)
         other.close()
 
 
@@ -206,18 +196,18 @@ def test_a_forked_child_reads_and_has_no_right_to_write(bank):
         assert same(reader.read(), rows)
         assert same(bank.read(), rows)
         with pytest.raises(LockedError, match="expected no other writer"):
-            bank.append(rows, seed=1)
+            append(bank, rows, 1)
 
     with forked(work) as is_running:
         assert is_running.join() == 0
-    assert bank.append(rows, seed=2) == 10
+    assert append(bank, rows, 2) == 10
     with pytest.raises(LockedError):  # the child's end gave nothing back
-        Bank(bank.path, simulator=simulator).append(rows, seed=3)
+        append(Bank(bank.path, simulator=simulator), rows, 3)
     bank.close()
 
     def write():
         with bank:
-            assert bank.append(rows, seed=4) == 10
+            assert append(bank, rows, 4) == 10
 
     with forked(write) as is_running:
         assert is_running.join() == 0
@@ -225,7 +215,7 @@ def test_a_forked_child_reads_and_has_no_right_to_write(bank):
 
 
 def test_what_is_stored_is_synchronized_with_the_disk(bank):
-    bank.append(simulate(simulator, *draw(10), seed=0), seed=0)
+    append(bank, simulate(simulator, *draw(10), seed=0), 0)
     with bank._store.reading() as connection:
         found = [
             connection.execute(f"PRAGMA {name}").fetchone()[0]

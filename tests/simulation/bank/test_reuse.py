@@ -8,6 +8,7 @@ from torch.distributions import Independent, Normal
 from sbi_active import Bank, simulate
 from sbi_active.seeding import row_normals
 from sbi_active.simulation import reuse
+from tests.simulation.bank.filled import append
 
 NOISE = 0.3
 
@@ -21,17 +22,16 @@ def normal(mean, sd):
 
 
 PRIOR, ROUND = normal(0.0, 2.0), normal(3.0, 1.0)
-PROPOSALS = {"prior": PRIOR, "round 1": ROUND}
 TARGET = normal(1.0, 0.5)
 
 
-def fill(bank, *, num_rows=2_000, seed=0, actions=((0.0, 1.0), (0.0, 1.0))):
-    """Store rows of both proposals, each with actions of its own."""
+def fill(bank, *, num_rows=2_000, seed=0):
+    """Store rows of both proposals, at two actions."""
     torch.manual_seed(seed)
-    for (label, proposal), own in zip(PROPOSALS.items(), actions, strict=True):
+    for proposal in (PRIOR, ROUND):
         theta = proposal.sample((num_rows,))
-        action = torch.tensor(own)[torch.randint(len(own), (num_rows, 1))]
-        store = bank.drawn_from(proposal, label=label)
+        action = torch.randint(2, (num_rows, 1)).float()
+        store = bank.drawn_from(proposal)
         simulate(simulator, theta, action, seed=seed, store=store)
 
 
@@ -49,9 +49,8 @@ def z_score(values, weights, exact):
     return float((mean - exact) / error)
 
 
-@pytest.mark.parametrize("proposals", [PROPOSALS, None])
-def test_weighted_rows_have_the_law_of_the_target(bank, proposals):
-    reused = reuse(bank, TARGET, proposals=proposals)
+def test_weighted_rows_have_the_law_of_the_target(bank):
+    reused = reuse(bank, TARGET)
     rows = reused.simulations()
     theta, weights = rows.theta[:, 0].double(), reused.weights
     assert float(weights.sum()) == pytest.approx(1)
@@ -69,37 +68,14 @@ def test_weighted_rows_have_the_law_of_the_target(bank, proposals):
     assert abs(z_score(theta, equal, 1.0)) > 10
 
 
-def test_proposals_may_have_met_with_other_actions(tmp_path):
-    with Bank(tmp_path / "bank", simulator=simulator) as bank:
-        uneven = ((0.0, 0.0, 0.0, 1.0), (0.0, 1.0, 1.0, 1.0))
-        fill(bank, num_rows=10_000, actions=uneven)
-    reused = reuse(bank, TARGET, proposals=PROPOSALS)
-    theta, own = bank.read().theta, reused.simulations().action[:, 0] == 0
-    mixture = 0.5 * (PRIOR.log_prob(theta).exp() + ROUND.log_prob(theta).exp())
-    mixed = (TARGET.log_prob(theta).exp() / mixture).double()
-    scores = []
-    for weights in (reused.weights, mixed):
-        w = weights[own] / weights[own].sum()
-        scores.append(z_score(theta[own, 0].double(), w, 1.0))
-    assert abs(scores[0]) < 4
-    assert abs(scores[1]) > 6  # negative control: one mixture for all actions
-
-
 def test_few_effective_rows_are_told(bank):
     far = normal(-7.5, 0.3)
     with pytest.warns(UserWarning, match=r"4000 rows of the bank are worth \d+\.\d"):
-        reused = reuse(bank, far, proposals=PROPOSALS)
+        reused = reuse(bank, far)
     assert reused.effective_sample_size < 50
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        reuse(bank, TARGET, proposals=PROPOSALS)
-
-
-def test_proposals_that_rows_were_not_drawn_from_are_refused(bank):
-    with pytest.raises(ValueError, match="got none for 'round 1'; give it"):
-        reuse(bank, TARGET, proposals={"prior": PRIOR})
-    with pytest.raises(ValueError, match=r"'prior'\] to be what its rows were drawn"):
-        reuse(bank, TARGET, proposals={"prior": ROUND, "round 1": ROUND})
+        reuse(bank, TARGET)
 
 
 def test_a_target_elsewhere(bank):
@@ -110,7 +86,6 @@ def test_a_target_elsewhere(bank):
     with pytest.raises(ValueError, match=r"expected rows in .*; got none"):
         reuse(empty, TARGET)
     with empty:
-        empty.append(bank.read(slice(0, 9)), seed=0)
-        for proposals in (None, PROPOSALS):
-            with pytest.raises(ValueError, match="got none whose proposal is known"):
-                reuse(empty, TARGET, proposals=proposals)
+        append(empty, bank.read(slice(0, 9)), 0)
+        with pytest.raises(ValueError, match="got none whose proposal is known"):
+            reuse(empty, TARGET)
