@@ -184,12 +184,8 @@ def row_of(number: int, kind: Kind, design: str) -> Row:
     report = verdict_of(case, number, design)
     tested = [
         {
-            "action": [round(v, 4) for v in trial.registered.action.tolist()],
-            "purpose": trial.registered.purpose,
             "before": trial.registered.verdict,
             "after": trial.after,
-            "distance": round(trial.distance, 3),
-            "limit": round(trial.registered.limit, 3),
             "held": bool(trial.held),
         }
         for trial in report.tested
@@ -198,7 +194,6 @@ def row_of(number: int, kind: Kind, design: str) -> Row:
         "verdict": report.verdict,
         "named": [*named(report)],
         "trials": len(tested) if design == "chosen" else NUM_TRIALS,
-        "stopped": report.stopped,
         "tested": tested,
         "cpu_seconds": round(time.process_time() - start, 1),
     }
