@@ -6,13 +6,10 @@ import numpy as np
 import pytest
 import torch
 from sbi.utils import BoxUniform
-from torch.distributions import HalfNormal, Independent, Normal
 
 from sbi_active import GaussianNoise, SimulatorModel
 from sbi_active.criticism import (
     Context,
-    Criticism,
-    Effect,
     Trials,
     close_loop,
     varying_parameters,
@@ -212,39 +209,6 @@ def test_zeros_are_taken_from_x_and_are_left_by_the_sensor_alone():
     changed = nuisance.apply(found.x, one, found.action, Context(torch.zeros(300)))
     assert torch.equal(changed[..., 0], x[..., 0])
     assert torch.allclose(changed[..., 1], found.x[..., 1] + 1)
-
-
-def level(theta, action, *, start=None, drag=0.0):
-    """Return x' = -theta x - drag x |x| from a start, (n, k)."""
-    x = torch.zeros(len(theta)).double() if start is None else start["level"].double()
-    found, dt = [], 0.025
-    for i in range(80):
-        x = x + dt * (action[:, 0] - theta[:, 0] * x - drag * x * x.abs())
-        if i % 4 == 3:
-            found.append(x)
-    return torch.stack(found, 1).to(theta.dtype)
-
-
-def test_a_loop_finds_what_a_start_at_rest_would_hide():
-    rng = np.random.default_rng(0)
-    action = torch.from_numpy(rng.uniform(1, 4, (10, 1)))
-    start = {"level": torch.from_numpy(rng.normal(1.5, 0.5, 10))}
-    theta = torch.full((10, 1), 2.3).double()
-    x = level(theta, action, start=start, drag=0.6)
-    x = x + SENSOR * torch.from_numpy(rng.normal(size=x.shape))
-    raw = Trials(action, x, sample_times=TIMES)
-    trials, nuisance = start_from_first_samples(
-        raw, {"level": 0}, within=0.35, sd=SENSOR, at=0.0
-    )
-    drag = Effect.keyword("drag", prior=HalfNormal(1.0))
-    model = SimulatorModel(level, noise=GaussianNoise(SENSOR), sample_times=TIMES)
-    prior = Independent(Normal(torch.tensor([2.0]), torch.tensor([0.7])), 1)
-    found = Criticism(model, prior, trials, effects=[nuisance, drag], seed=0)
-    tracing = found.trace()
-    assert tracing.verdict == "drag"
-    draws = tracing.evidences["drag"].draws
-    z = (draws.mean(0) - [2.3, 0.6]) / draws.std(0)
-    assert (np.abs(z) < 3.5).all()
 
 
 def test_a_line_that_hides_gravity_is_said():
