@@ -79,7 +79,7 @@ def test_the_alias_is_withdrawn_by_the_rule_that_named_it():
     first = report.tested[0]
     assert (first.registered.verdict, first.held) == ("lift", False)
     assert first.distance > 3 * first.registered.limit
-    assert "SA531" in [w.code for w in report.warnings]
+    assert "failed" in str(report)
 
 
 @pytest.mark.parametrize("seed", range(2))
