@@ -174,23 +174,17 @@ def verdict_of(case: Case, number: int, design: str) -> Report:
 
 def row_of(number: int, kind: Kind, design: str) -> Row:
     """Return the row of one case and design."""
-    group = ("own", "letters")[number % 2]
-    case = draw_case(group, kind, number)
+    case = draw_case(("own", "letters")[number % 2], kind, number)
     truth = case.truth
     right = frozenset().union(*[truth.machine.equivalent(n) for n in truth.names])
-    row = {"group": group, "machine": truth.machine.name, "true": [*truth.names]}
-    row |= {"right": sorted(right) if kind == "E" else []}
     start = time.process_time()
     report = verdict_of(case, number, design)
     tested = [
-        {
-            "before": trial.registered.verdict,
-            "after": trial.after,
-            "held": bool(trial.held),
-        }
+        {"before": trial.registered.verdict, "held": bool(trial.held)}
         for trial in report.tested
     ]
-    return row | {
+    return {
+        "right": sorted(right) if kind == "E" else [],
         "verdict": report.verdict,
         "named": [*named(report)],
         "trials": len(tested) if design == "chosen" else NUM_TRIALS,
