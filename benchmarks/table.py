@@ -214,6 +214,16 @@ def leaves(value: Any, path: tuple[str, ...] = ()) -> Iterator[tuple[str, str]]:
         yield ", ".join(path), shown
 
 
+def shown(path: Path, *only: str) -> str:
+    """Return the numbers of a file below patterns of paths as a Markdown table."""
+    cells = [
+        [name, value]
+        for name, value in leaves(json.loads(path.read_text()))
+        if any(fnmatch(name, pattern) for pattern in only or ("*",))
+    ]
+    return Table(["what", "value"], cells).markdown()
+
+
 def main(file: str, *, only: Sequence[str] = ("*",)) -> int:
     """Print the table.
 
@@ -226,15 +236,9 @@ def main(file: str, *, only: Sequence[str] = ("*",)) -> int:
         print(*lines, sep="\n")
         print(*misses, sep="\n", file=sys.stderr)
         return 1 if misses else 0
-    path, header = HERE / file, ["what", "value"]
-    if path.suffix == ".csv":
+    if (path := HERE / file).suffix == ".csv":
         rows = read(path)
-        header, cells = [*rows[0]], [[*row.values()] for row in rows]
+        print(Table([*rows[0]], [[*row.values()] for row in rows]).markdown())
     else:
-        cells = [
-            [name, value]
-            for name, value in leaves(load(file))
-            if any(fnmatch(name, pattern) for pattern in only)
-        ]
-    print(Table(header, cells).markdown())
+        print(shown(path, *only))
     return 0

@@ -27,7 +27,7 @@ def effect(name="bias", **changes):
 
 def on_outcomes(name, apply, sd=1.0, **changes):
     """Return an effect on outcomes, of one strength that is normal about zero."""
-    return effect(name, apply=apply, prior=normal(sd), **changes)
+    return effect(name, apply=apply, **({"prior": normal(sd)} | changes))
 
 
 def added(name, form, sd=1.0, **changes):

@@ -118,26 +118,18 @@ def test_a_belief_predicts_outcomes_at_actions(campaign):
 
 @pytest.fixture(scope="module")
 def report():
+    noise = GaussianNoise(0.1)
     model = SimulatorModel(
-        lambda theta, action: theta * action,
-        noise=GaussianNoise(0.1),
-        parameter_names=["gain"],
+        lambda theta, action: theta * action, noise=noise, parameter_names=["gain"]
     )
     prior = BoxUniform(torch.zeros(1), 2 * torch.ones(1))
     action = torch.linspace(0.5, 2.0, 40)[:, None]
-    x = 0.8 * action + 0.2
     actions = BoxActions([0.5], [2.0], names=["push"], units=["N"])
     effects = generic_effects(model, actions)
-    return close_loop(
-        model,
-        prior,
-        Trials(action, x),
-        effects=[e for e in effects if "offset" in e.name or "bias" in e.name],
-        actions=actions,
-        seed=0,
-        evaluate=False,
-        plan=False,
-    )
+    few = [e for e in effects if "offset" in e.name or "bias" in e.name]
+    trials = Trials(action, 0.8 * action + 0.2)
+    options = {"effects": few, "evaluate": False, "plan": False, "seed": 0}
+    return close_loop(model, prior, trials, actions=actions, **options)
 
 
 def test_rivals_of_a_report_are_compared(report):

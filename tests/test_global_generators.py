@@ -43,28 +43,22 @@ def by_numpy(theta, action):
     return (theta * action).numpy() + 0.1 * np.random.randn(*theta.shape)
 
 
-class Kept:
-    """Checks that calls leave both generators as they were; counts them."""
-
-    def __init__(self):
-        self.changed = []
-
-    def __call__(self, name, call):
-        before, numpy_before = torch.get_rng_state(), np.random.get_state()
-        result = call()
-        kept = torch.equal(before, torch.get_rng_state())
-        after = np.random.get_state()
-        kept &= (numpy_before[1] == after[1]).all() and numpy_before[2] == after[2]
-        if not kept:
-            self.changed.append(name)
-        return result
-
-
 @pytest.fixture
 def kept():
-    kept = Kept()
-    yield kept
-    assert kept.changed == []
+    """Return what checks that calls leave both generators as they were."""
+    changed = []
+
+    def check(name, call):
+        before, numpy_before = torch.get_rng_state(), np.random.get_state()
+        result = call()
+        after = np.random.get_state()
+        same = torch.equal(before, torch.get_rng_state())
+        same &= (numpy_before[1] == after[1]).all() and numpy_before[2] == after[2]
+        changed.extend([] if same else [name])
+        return result
+
+    yield check
+    assert changed == []
 
 
 def test_a_campaign(kept):
@@ -84,53 +78,37 @@ def test_a_campaign(kept):
     kept("run", lambda: c.run(lambda action: 0.6 * action, num_rounds=1))
 
 
-def trained(trainer):
-    return trainer.append_simulations(THETA, X, action=ACTION, belief=PRIOR)
-
-
 @pytest.mark.parametrize("make", [ASBI, ALHI, SeqBED])
 def test_a_trainer_after_training(kept, make):
-    is_ratio = make is SeqBED
-    network = replace(
-        RATIOS if is_ratio else OPTIONS.density_estimator, num_iterations=5
-    )
-    trainer = trained(make(PRIOR, network, show_progress_bars=False))
-    trainer.train()
+    network = RATIOS if make is SeqBED else OPTIONS.density_estimator
+    network = replace(network, num_iterations=5)
+    trainer = make(PRIOR, network, show_progress_bars=False)
+    trainer.append_simulations(THETA, X, action=ACTION, belief=PRIOR).train()
     model = kept("build_posterior", trainer.build_posterior)
     designer = InformationGainDesigner(ACTIONS, num_samples=100)
     kept("select", lambda: designer.select(model, MODEL, belief=PRIOR, seed=1))
-    settings = OPTIONS.refinement
-    told = {"simulator": MODEL, "refinement": settings, "seed": 3}
-    belief = kept(
-        "update", lambda: trainer.update(REAL[1][0], action=REAL[0][0], **told)
-    )
-    kept("log_prob", lambda: belief.log_prob(THETA))
+    own = {"refinement": OPTIONS.refinement, "seed": 3}
     trials = [Observation(*pair) for pair in zip(*REAL, strict=True)]
-    kept(
-        "update_all",
-        lambda: trainer.update_all(trials, MODEL, refinement=settings, seed=3),
-    )
+    told = {"action": REAL[0][0], "simulator": MODEL} | own
+    belief = kept("update", lambda: trainer.update(REAL[1][0], **told))
+    kept("log_prob", lambda: belief.log_prob(THETA))
+    kept("update_all", lambda: trainer.update_all(trials, MODEL, **own))
 
 
 def test_designers_and_refinement(kept):
     box = BoxActions([0.1], [3.0])
-    kept("actions", lambda: [a.sample((3,), seed=1) for a in (ACTIONS, box)])
-    mixed = kept(
-        "MixedActions", lambda: MixedActions(ACTIONS, BoxActions([0.0], [1.0]))
-    )
-    kept("mixed", lambda: mixed.sample((3,), seed=1))
+    mixed = MixedActions(ACTIONS, BoxActions([0.0], [1.0]))
+    for actions in (ACTIONS, box, mixed):
+        kept("actions", lambda a=actions: a.sample((3,), seed=1))
+    given = {"belief": PRIOR, "seed": 1}
     for actions in (ACTIONS, box):
         random = kept("RandomDesigner", lambda a=actions: RandomDesigner(a))
-        kept("random", lambda d=random: d.select(None, MODEL, belief=PRIOR, seed=1))
-    designer = kept(
-        "designer", lambda: InformationGainDesigner(ACTIONS, num_samples=50)
-    )
-    kept("select", lambda: designer.select(None, noisy, belief=PRIOR, seed=1))
+        kept("random", lambda d=random: d.select(None, MODEL, **given))
+    designer = InformationGainDesigner(ACTIONS, num_samples=50)
+    kept("select", lambda: designer.select(None, noisy, **given))
     settings = OPTIONS.refinement
-    belief = kept(
-        "refine", lambda: refine(noisy, PRIOR, *REAL, settings=settings, seed=1)
-    )
-    kept("mean", lambda: (belief.mean, belief.diagnostics, repr(belief)))
+    own = kept("refine", lambda: refine(noisy, PRIOR, *REAL, settings=settings, seed=1))
+    kept("mean", lambda: (own.mean, own.diagnostics, repr(own)))
 
 
 def test_simulators_and_noise(kept):

@@ -23,6 +23,7 @@ import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from importlib.metadata import version
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -95,14 +96,9 @@ def campaign(method: str) -> list[Any]:
     task = get_task("numerical")
     options = SMALL
     if method == "seqbed":
-        options = CampaignOptions(
-            num_simulations=600,
-            num_samples=200,
-            details=CampaignDetails(num_scored=200),
-        )
-    run = Campaign(
-        task.simulator, task.prior, task.actions, method=method, seed=3, options=options
-    )
+        options = replace(SMALL, density_estimator=CampaignOptions().density_estimator)
+    given = {"method": method, "seed": 3, "options": options}
+    run = Campaign(task.simulator, task.prior, task.actions, **given)
     with forked_generators(4):
         run.run(task.real_system, num_rounds=2)
     with forked_generators(0):
@@ -117,15 +113,13 @@ def gain(estimator: str) -> list[Any]:
     actions = DiscreteActions(torch.arange(-5, 5.5, 2.5))
     simulator = SimulatorModel(response("linear"), noise=GaussianNoise(1.0))
     network = MixtureDensity(num_iterations=60)
-    trainers = {
-        "likelihood": lambda: ALHI(BOX, network, show_progress_bars=False),
-        "ratio": lambda: SeqBED(BOX, show_progress_bars=False),
-        "info_nce": lambda: SeqBED(BOX, show_progress_bars=False),
-    }
     model = None
     if estimator not in ("entropy", "nested"):
-        make = trainers.get(estimator)
-        inference = make() if make else ASBI(BOX, network, show_progress_bars=False)
+        if estimator in ("ratio", "info_nce"):
+            inference: Any = SeqBED(BOX, show_progress_bars=False)
+        else:
+            make = ALHI if estimator == "likelihood" else ASBI
+            inference = make(BOX, network, show_progress_bars=False)
         with forked_generators(1):
             theta, action = BOX.sample((600,)), actions.sample((600,), seed=1)
             x = simulator(theta, action)
@@ -180,12 +174,9 @@ def many(num_parameters: int) -> list[Any]:
     prior = BoxUniform(-3 * torch.ones(num_parameters), 3 * torch.ones(num_parameters))
     inference = ASBI(prior, show_progress_bars=False)
     trials = [Observation(torch.ones(1), row) for row in x]
-    belief = inference.update_all(
-        trials,
-        simulator=simulator,
-        seed=7,
-        refinement=RefinementOptions(num_histories=600, num_effective=50),
-    )
+    settings = RefinementOptions(num_histories=600, num_effective=50)
+    given = {"simulator": simulator, "seed": 7, "refinement": settings}
+    belief = inference.update_all(trials, **given)
     with forked_generators(0):
         draws = belief.sample(torch.Size([64]))
     return [draws.mean(0), draws, belief.log_prob(draws)]
@@ -195,14 +186,8 @@ def adoption() -> list[Any]:
     """Return a campaign before and after it adopts an effect."""
     problem = draw_case(get_world("A"), "library", 1, num_trials=8).problem
     options = replace(SMALL, refinement=RefinementOptions(num_histories=400))
-    run = Campaign(
-        problem.model,
-        problem.prior,
-        get_world("A").actions,
-        effects=problem.effects,
-        seed=1,
-        options=options,
-    )
+    given = {"effects": problem.effects, "seed": 1, "options": options}
+    run = Campaign(problem.model, problem.prior, get_world("A").actions, **given)
     trials = problem.trials
     for action, x in zip(trials.action[:6], trials.x[:6], strict=True):
         run.tell(x, action=action)
@@ -278,12 +263,9 @@ def runs() -> Iterator[tuple[str, Run]]:
         yield f"refinement, {number} parameters", lambda d=number: many(d)
     yield "adoption", adoption
     for world, numbers in (("A", (0, 1)), ("B", (0, 1)), ("C", (0,))):
-        for kind in ("clean", "library"):
-            for number in numbers:
-                yield (
-                    f"verdict, {world} {kind} {number}",
-                    lambda w=world, k=kind, n=number: verdict(w, k, n),
-                )
+        for case in product((world,), ("clean", "library"), numbers):
+            name = "verdict, {} {} {}".format(*case)
+            yield name, lambda own=case: verdict(*own)
     yield "next action", plan
     yield "box", box
     for workers in (1, 2):

@@ -120,10 +120,6 @@ def belief_row(problem: str, kind: str, seed: int) -> dict[str, object]:
     )
     return {
         "verdict": found.verdict,
-        "beyond": " ".join(f"{a:.3g}" for a, _ in found.refits),
-        "within": " ".join(f"{b:.3g}" for _, b in found.refits),
-        "spread": " ".join(f"{v:.3g}" for v in found.spread),
-        "p_value": " ".join(f"{v:.2g}" for v in found.p_value),
         "cpu_seconds": time.process_time() - begin,
         "reason": found.reasons[0] if found.reasons else "",
     }

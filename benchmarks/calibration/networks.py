@@ -139,11 +139,6 @@ def network_row(problem: str, kind: str, seed: int) -> dict[str, object]:
     return {
         "steps": steps,
         "verdict": found.verdict,
-        "flagged_strata": sum(flagged),
-        "strata": len(flagged),
-        "coverage": found.overall.coverage,
-        "gap": found.overall.gap,
-        "lost": found.overall.lost,
         "wrong_flagged": "" if wrong is None else int(flagged[wrong]),
         "others_flagged": "" if wrong is None else sum(others),
         "cpu_seconds": time.process_time() - begin,

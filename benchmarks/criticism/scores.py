@@ -86,9 +86,6 @@ def score_case(case: Case, number: int, *, oracle: bool = False) -> dict[str, ob
     problem, truth = case.problem, case.truth
     row: dict[str, object] = {
         "effects": " + ".join(truth.names) or "none",
-        "strengths": " ".join(f"{float(s):.6g}" for s in truth.strengths),
-        "theta": " ".join(f"{v:.6g}" for v in truth.theta[0].tolist()),
-        "correlation": truth.correlation,
         "lambda": truth.non_centrality,
         "support": _support(case),
     }
@@ -118,7 +115,6 @@ def read_report(report: Report) -> dict[str, object]:
         "equivalent": json.dumps([sorted(group) for group in report.equivalent]),
         "formula": report.guess or "",
         "undeclared": int(UNDECLARED in repr(report)),
-        "warnings": len(report.warnings),
     }
     for metric, before, after, *_ in report.before_after.itertuples(index=False):
         if metric in ("rmse", "coverage"):

@@ -7,11 +7,11 @@ The machines, the effects and what nobody declared are those of the misfit bench
 its kinds E (the cause is declared), R (the cause is removed from the library) and C
 (clean, for what the loop costs where nothing is missing: chosen trials alone); B is
 world B of the criticism benchmark with a cause of its library, most of which have near
-twins, and "B outside" with one that it never had. All designs take trials from the same 32 permitted actions, drawn as the actions of the
-trials were, or (``--reach 1.5``) up to half of that range farther from its middle, as a
-machine's limits are wider than what was tried: "chosen" by
-``close_loop(real_system=)``, "random", "spread out" (farthest from all before); "none"
-is the verdict before any.
+twins, and "B outside" with one that it never had. All designs take trials from the same
+32 permitted actions, drawn as the actions of the trials were, or (``--reach 1.5``) up
+to half of that range farther from its middle, as a machine's limits are wider than what
+was tried: "chosen" by ``close_loop(real_system=)``, "random", "spread out" (farthest
+from all before); "none" is the verdict before any.
 
 Seeds are the numbers of cases. **Those from 6,000 on judge**, and no other benchmark
 has them; those below are for tuning. Resumable: one row of JSON a case and
@@ -259,7 +259,6 @@ def row_of(number: int, kind: Kind, design: str, reach: float) -> Row:
         "verdict": report.verdict,
         "named": [*named(report)],
         "trials": len(tested) if design == "chosen" else NUM_TRIALS,
-        "stopped": report.stopped,
         "tested": tested,
         "cpu_seconds": round(time.process_time() - start, 1),
     }

@@ -176,7 +176,6 @@ def roll_out(policy: str, rollout: int, num_trials: int) -> dict[str, Any]:
         "effective": effective,
         "cpu_bounds": time.process_time() - start,
         "places": " ".join(f"{v:.6g}" for v in action.flatten().tolist()),
-        "outcomes": " ".join(f"{v:.6g}" for v in x.flatten().tolist()),
     }
     row |= {f"cpu_{stage}": spent for stage, spent in seconds.items()}
     if isinstance(player, Myopic):

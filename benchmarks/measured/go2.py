@@ -18,9 +18,9 @@ What plain least squares of the same run found stands in ``go2.md``.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,12 +33,11 @@ from benchmarks.measured.go2_leg import (
     read_leg,
     usual_parameters,
 )
-from benchmarks.measured.record_stages import causes, center, row_of, said
+from benchmarks.measured.record_stages import center, row_of
 from benchmarks.rows import add, measured, stages
+from benchmarks.table import shown
 from sbi_active.criticism import Criticism, Effect
-from sbi_active.criticism.report.summary import misfit_line
-from sbi_active.criticism.results import ModelKey, Tracing
-from sbi_active.display.table import Table
+from sbi_active.criticism.results import ModelKey
 from sbi_active.mujoco import mjcf_effects
 from sbi_active.mujoco.robot import Robot
 
@@ -50,13 +49,6 @@ KINDS = ("friction loss by *", "static friction", "quadratic damping", "*stiffne
 KINDS += ("zero offset", "sensor bias", "sensor delay")
 #: The same for the other legs, and with an effect removed: what was near on the first.
 FEW_KINDS = ("friction loss by *", "static friction")
-
-
-def line_of(tracing: Tracing) -> str:
-    """Return the first line of a report on a verdict."""
-    if tracing.misfit is None:
-        return f"Verdict: {tracing.verdict}"
-    return f"Verdict: {misfit_line(tracing.verdict, tracing.misfit)}"
 
 
 def judge(leg: Leg, library: Callable[[Robot], Sequence[Effect]]) -> dict[str, Any]:
@@ -84,32 +76,25 @@ def judge(leg: Leg, library: Callable[[Robot], Sequence[Effect]]) -> dict[str, A
     values = center(tracing.evidences[str(ModelKey(tracing.chosen))])
     bare = center(tracing.evidences[str(ModelKey())])
     return row_of(tracing) | {
-        "line": line_of(tracing),
-        "values": values[0].tolist(),
         "after": leg.errors(leg.free_run(parameters, helps, values)[0]),
         "before": leg.errors(leg.free_run(parameters, [], bare)[0]),
-        "bare values": bare[0].tolist(),
         "cpu_seconds": time.process_time() - begin,
         "trial_simulations": count(),
     }
 
 
-def main(
-    *,
-    data: Path = DATA,
-    legs: Annotated[Sequence[str], LEGS] = (*LEGS,),
-) -> None:
+def main(*, data: Path = DATA) -> None:
     """Run the stages that are missing from the results, and print the tables.
 
     Args:
         data: Folder of the measured set.
-        legs: Names of legs.
     """
-    every, rows = [measured(read_leg, data, name) for name in legs], stages(RESULT)
+    every, rows = [measured(read_leg, data, name) for name in LEGS], stages(RESULT)
     for leg in every:
         for name, row in _stages(leg, rows):
             add(RESULT, rows, name, row)
-    print(tables(rows))
+    figures = ("verdict", "helps", "support", "before", "after", "parameters")
+    print(shown(RESULT, *(f"*, {name}*" for name in figures), "*cpu_seconds"))
 
 
 def _library(
@@ -135,31 +120,3 @@ def _stages(leg: Leg, rows: dict[str, Any]) -> Iterator[tuple[str, Any]]:
     helps = rows[own]["helps"]
     if (name := f"{own}, removed") not in rows:
         yield name, judge(leg, _library(leg, helps, few=True))
-
-
-def tables(rows: Mapping[str, Any]) -> str:
-    """Return verdicts, errors and parameters by stage, in Markdown."""
-    judged = {name: row for name, row in rows.items() if "line" in row}
-    verdicts, errors = [], []
-    for name, row in judged.items():
-        cost = f"{row['trial_simulations']:,}", f"{row['cpu_seconds']:.0f}"
-        errors.append((f"{name}: before", *_errors(row["before"])))
-        verdicts.append((name, said(row), causes(row), *cost))
-        errors.append((f"{name}: after", *_errors(row["after"])))
-    values = [
-        (what, f"{mean:.3g} +- {sd:.2g}")
-        for name, row in judged.items()
-        for what, (mean, sd) in row["parameters"].items()
-        if "," not in name
-    ]
-    header = ("stage", "verdict", "excess left", "simulated trials", "CPU s")
-    parts = [
-        Table(header, verdicts),
-        Table(("RMSE, mrad: hip / thigh / knee", *PARTS), errors),
-        Table(("parameters and strengths", "mean +- sd"), values),
-    ]
-    return "\n\n".join(part.markdown() for part in parts)
-
-
-def _errors(row: Mapping[str, Any]) -> tuple[str, ...]:
-    return tuple(" / ".join(f"{1e3 * e:.1f}" for e in row[part]) for part in PARTS)

@@ -12,7 +12,6 @@ What the loop says of recorded trials: the one place that knows a report's layou
 from __future__ import annotations
 
 import re
-from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,10 +23,10 @@ from torch import Tensor
 
 from benchmarks.criticism.problem import Problem
 from benchmarks.rows import add, keep, measured, stages
+from benchmarks.table import shown
 from sbi_active import SimulatorModel
 from sbi_active.criticism import Effect, Report, Trials
 from sbi_active.criticism.results import NONE, Evidence, Tracing
-from sbi_active.display.table import Table
 
 #: What a report's first paragraph says of an effect that is named.
 SHARE_LEFT = re.compile(r"\d+ %\s+of\s+the\s+excess")
@@ -43,15 +42,12 @@ def row_of(tracing: Tracing) -> dict[str, Any]:
         "named": [*(helps if misfit is None else misfit.named)],
         "helps": [*helps],
         "open_forms": {} if misfit is None else misfit.open_forms,
-        "inclusion": {name: float(p) for name, p in tracing.inclusion.items()},
         "support": {
             name: [own.inclusion, own.gained, own.remains]
             for name, own in support.items()
         },
         "probabilities": {n: float(p) for n, p in tracing.probabilities.items()},
         "credible_set": [*tracing.credible_set],
-        "near": [sorted(group) for group in tracing.near],
-        "log_evidence": {k: e.log_evidence for k, e in tracing.evidences.items()},
         "parameters": spreads(model),
     }
 
@@ -63,7 +59,6 @@ def read_report(report: Report) -> dict[str, Any]:
         "text": str(report).split("\n\n")[0],
         "alarm": bool(report.detection.alarm),
         "log_bayes_factor": float(report.detection.log_bayes_factor),
-        "warnings": [*report.warnings],
     }
 
 
@@ -176,20 +171,21 @@ def stages_of(
         path: File of the results.
     """
 
-    def main(*, data: Path = task.DATA, clean: int = 10) -> None:
+    def main(*, data: Path = task.DATA) -> None:
         """Run the stages that are missing from the results, and print the tables.
 
         Args:
             data: Folder of the measured set.
-            clean: Number of clean sets.
         """
         records = measured(task.read_recordings, data)
-        print(table(run_stages(make_bench(records), path, clean), "V"))
+        run_stages(make_bench(records), path)
+        figures = ("verdict", "named", "helps", "support", "before", "after", "fitted")
+        print(shown(path, *(f"*, {name}*" for name in figures), "*held*", "*cpu*"))
 
     return main
 
 
-def run_stages(bench: Bench, path: Path, clean: int) -> dict[str, Any]:
+def run_stages(bench: Bench, path: Path, clean: int = 10) -> dict[str, Any]:
     """Run the stages that a file lacks, and return all of them.
 
     Args:
@@ -243,72 +239,6 @@ def judge(
         row["before"] = bench.score(center(evidences[NONE], dim), [])
         row["after"] = bench.score(center(best, num), chosen)
     return row
-
-
-def table(rows: dict[str, Any], unit: str) -> str:
-    """Return the stages and the least-squares fits in Markdown.
-
-    Args:
-        rows: Stages by name.
-        unit: Unit of the errors.
-    """
-    head = " / ".join(rows["recorded"]["before"])
-    judged = {k: row for k, row in rows.items() if "before" in row}
-    cells = [
-        (
-            *(name, said(row), causes(row) if row["alarm"] else ""),
-            *(_errors(row["before"]), _errors(row["after"])),
-            *(f"{row['trial_simulations']:,}", f"{row['cpu_seconds']:.0f}"),
-        )
-        for name, row in judged.items()
-    ]
-    header = ["stage", "verdict", "excess left", f"before, {unit}: {head}", "after"]
-    header += ["simulated trials", "CPU s"]
-    parts = [Table(header, cells + _replays(rows)).markdown()]
-    if any(name.startswith("without ") for name in rows):
-        parts.append(aliases(rows))
-    fits = [
-        (name, f"{row['fitted']:.3f}", _errors(row["held"]))
-        for name, row in rows["least squares"].items()
-    ]
-    parts.append(Table(("least squares", f"fitted, {unit}", head), fits).markdown())
-    return "\n\n".join(parts)
-
-
-def _replays(rows: dict[str, Any]) -> list[tuple[str, ...]]:
-    """Return cells of the replays of the bare model: verdicts, and how often."""
-    own = {k: row for k, row in rows.items() if k.startswith("clean ")}
-    if not own:
-        return []
-    verdicts = Counter(str(row["verdict"]) for row in own.values())
-    told = ", ".join(f"{v} ({n})" for v, n in verdicts.most_common())
-    seeds = sorted(int(k.split(" ")[-1]) for k in own)
-    count, seconds = (
-        np.median([row[key] for row in own.values()])
-        for key in ("trial_simulations", "cpu_seconds")
-    )
-    name = f"{len(own)} replays of the bare model, seeds {seeds[0]} to {seeds[-1]}"
-    return [(name, told, "", "", "", f"{count:,.0f}", f"{seconds:.0f}")]
-
-
-def aliases(rows: dict[str, Any]) -> str:
-    """Return how often an effect was named that stands for one that was removed.
-
-    One counts that the verdict with the whole library does not rest on.
-    """
-    removed = {k: row for k, row in rows.items() if k.startswith("without ")}
-    real = {*rows["recorded"]["helps"]}
-    found, told = [], 0
-    for name, row in removed.items():
-        if new := [n for n in row["named"] if n not in real]:
-            found.append(f"{' + '.join(new)} ({name})")
-            told += shares_left(row)
-    words = f": {'; '.join(found)}; the share left said in {told}" if found else ""
-    return f"Aliases named: {len(found)} of {len(removed)} removals{words}."
-
-
-def _errors(errors: Errors) -> str:
-    return " / ".join(f"{e:.3f}" for e in errors.values())
 
 
 def with_error(x: Tensor, sd: float, seed: int) -> np.ndarray:

@@ -28,13 +28,13 @@ import torch
 from numpy.typing import NDArray
 
 from benchmarks.fitting import best_in_box
-from benchmarks.measured.record_stages import causes, read_report, said, spreads
+from benchmarks.measured.record_stages import read_report, spreads
 from benchmarks.rows import add, measured, stages
+from benchmarks.table import shown
 from sbi_active.criticism import Criticism
 from sbi_active.criticism.results import NONE, SCATTER, UNEXPLAINED
-from sbi_active.display.table import Table
 from sbi_active.simulation import AutocorrelatedNoise
-from sbi_active.tasks.servo_pendulum import Recordings, ServoPendulumTask  # pyright: ignore
+from sbi_active.tasks.servo_pendulum import ServoPendulumTask  # pyright: ignore
 from sbi_active.tasks.servo_pendulum.model import PRIOR_HIGH, PRIOR_LOW, angles  # pyright: ignore
 from sbi_active.tasks.servo_pendulum.task import DATA  # pyright: ignore
 
@@ -71,9 +71,7 @@ class Fit:
 
 
 def fit(
-    task: ServoPendulumTask,
-    trials: Sequence[int],
-    names: Sequence[str] = (),
+    task: ServoPendulumTask, trials: Sequence[int], names: Sequence[str] = ()
 ) -> Fit:
     """Return the least-squares fit of the simulator with some effects.
 
@@ -107,9 +105,7 @@ def fit(
 
 
 def judge(
-    task: ServoPendulumTask,
-    fitted: Sequence[int],
-    held_out: Sequence[int] = (),
+    task: ServoPendulumTask, fitted: Sequence[int], held_out: Sequence[int] = ()
 ) -> Row:
     """Return what some recorded trials say.
 
@@ -119,14 +115,9 @@ def judge(
         held_out: Numbers of the trials that are only scored.
     """
     begin = time.process_time()
-    loop = Criticism(
-        task.simulator,
-        task.prior,
-        task.trials(fitted, held_out),
-        effects=task.effects(),
-        actions=task.actions,
-        seed=0,
-    )
+    given = task.simulator, task.prior, task.trials(fitted, held_out)
+    own = {"effects": task.effects(), "actions": task.actions, "seed": 0}
+    loop = Criticism(*given, **own)
     report = loop.report(evaluate=len(held_out) > 0)
     evidences, model = report.tracing.evidences, report.tracing.model
     row = read_report(report) | {
@@ -246,56 +237,5 @@ def main(
     rows = stages(RESULT)
     for name, row in missing(task, rows, NUM_CLEAN if replay == "clean" else 0):
         add(RESULT, rows, name, row)
-    print(tables(rows, task.recordings))
-
-
-def tables(rows: dict[str, Row], recordings: Recordings) -> str:
-    """Return what each stage says, in Markdown.
-
-    Args:
-        rows: Stages by name.
-        recordings: Recordings, for the names of trials.
-    """
-    cells = [
-        (
-            *(name, len(row["fitted"])),
-            said(row) if "helps" in row else row["verdict"],
-            *(causes(row), ", ".join(row["credible_set"])),
-            f"{row['log_bayes_factor']:.1f}",
-            *(_next(row, recordings), f"{row['seconds']:.0f}"),
-        )
-        for name, row in rows.items()
-    ]
-    header = ["stage", "trials", "verdict", "excess left", "90 % set", "log BF"]
-    parts = [Table([*header, "next trial", "CPU s"], cells).markdown()]
-    if "motor off" in rows:
-        parts.append(_errors(rows["motor off"], recordings))
-    return "\n\n".join(parts)
-
-
-def _next(row: Row, recordings: Recordings) -> str:
-    if "gain" not in row:
-        return ""
-    if row["next"] is None:
-        return "none"
-    return f"{_trial(row['next'], recordings)} ({max(row['gain']):.2f} nats)"
-
-
-def _errors(row: Row, recordings: Recordings) -> str:
-    """Return the held-out errors beside plain least squares."""
-    scores = row["before_after"]
-    place = [metric.lower() for metric in scores["metric"]].index("rmse")
-    cells = []
-    for when, what in (("before", "bare model"), ("after", row["model"])):
-        own = [f"{v:.3f}" for v in row["rmse"][when]]
-        cells.append((f"{when}: {what}", "", f"{scores[when][place]:.4f}", *own))
-    for name, found in row["least squares"].items():
-        sizes = f"{found['train']:.4f}", f"{found['held_out']:.4f}"
-        own = [f"{v:.3f}" for v in found["each"]]
-        cells.append((f"least squares: {name}", *sizes, *own))
-    each = [_trial(i, recordings) for i in row["held_out"]]
-    return Table(("RMSE, rad", "fitted", "held out", *each), cells).markdown()
-
-
-def _trial(number: int, recordings: Recordings) -> str:
-    return f"{recordings.trajectory[number]} {recordings.kp[number]:.0f}"
+    figures = ("verdict", "helps", "support", "next", "rmse", "least squares")
+    print(shown(RESULT, *(f"*, {name}*" for name in figures), "*seconds"))

@@ -9,7 +9,6 @@ sensor deviations for a discrepancy, 1 to 6 times as much for an effect.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from itertools import count
@@ -21,7 +20,7 @@ from torch import Tensor
 from torch.distributions import Uniform
 
 from benchmarks.criticism.problem import Problem
-from benchmarks.misfit.discrepancies import draw_discrepancy
+from benchmarks.misfit.discrepancies import draw_discrepancy, one
 from benchmarks.misfit.machines import GROUPS, LAYOUTS, Machine, get_machine
 from benchmarks.misfit.machines.machine import is_positive, scale_of
 from benchmarks.misfit.truth import LARGEST, Setup, Truth
@@ -92,9 +91,9 @@ def _drawn(machine: Machine, kind: Kind, *, is_judged: bool) -> Truth | None:
     visible = [e for e in machine.library if e.name not in machine.equivalent("none")]
     effects: tuple[Effect, ...] = ()
     if kind in ("E", "R", "CE"):
-        effects = (_one(visible),)
+        effects = (one(visible),)
     elif kind == "P":
-        effects = tuple(machine.effect(_one(n)) for n in (machine.fast, machine.slow))
+        effects = tuple(machine.effect(one(n)) for n in (machine.fast, machine.slow))
     discrepancy, strength, size = None, 0.0, 0.0
     if kind not in ("C", "CE"):
         size = _log_between(*SIZES)
@@ -146,10 +145,6 @@ def _sized_effect(setup: Setup, size: float, effect: Effect) -> Tensor | None:
         size, lambda s: readings(s[:, None] * direction), largest=LARGEST
     )
     return None if strength is None else strength * direction[None]
-
-
-def _one(among: Sequence):
-    return among[int(torch.randint(len(among), (1,)))]
 
 
 def _log_between(low: float, high: float) -> float:

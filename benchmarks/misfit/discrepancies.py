@@ -80,17 +80,17 @@ def draw_discrepancy(
         is_judged: Whether forms are those on which nothing was tuned.
     """
     kinds = ["process", "wandering", "form", *["force"] * machine.takes_force]
-    kind = _one(kinds)
+    kind = one(kinds)
     num = len(action)
     nothing = torch.zeros(num, 0, dtype=torch.float64)
     rough = is_judged and bool(torch.rand(()) < 0.5)
-    shared = _one(SHARED)
+    shared = one(SHARED)
     if kind == "form":
-        name = _one(machine.unseen_forms if is_judged else machine.forms)
-        sign = 1.0 if name in machine.unsigned_forms else _one((-1.0, 1.0))
+        name = one(machine.unseen_forms if is_judged else machine.forms)
+        sign = 1.0 if name in machine.unsigned_forms else one((-1.0, 1.0))
         return Discrepancy(kind, name, nothing, sign)
     if kind == "wandering":
-        name = _one(machine.wandering)
+        name = one(machine.wandering)
         if machine.num_steps == 1:  # from trial to trial
             grid = torch.linspace(0, 1, num, dtype=torch.float64)
             series = smooth_series(grid, 1, _between(*SLOW_LENGTHS)).T
@@ -145,7 +145,8 @@ def _grid(machine: Machine) -> Tensor:
     return (steps + 0.5) / machine.num_steps
 
 
-def _one(among: Sequence):
+def one(among: Sequence):
+    """Return one of them by torch's generator."""
     return among[int(torch.randint(len(among), (1,)))]
 
 

@@ -59,7 +59,6 @@ def row_of(group: str, kind: Kind, number: int) -> dict[str, object]:
     # The truth has the held-out trials.
     report, cost = case.problem.counted_report(number, evaluate=False, plan=False)
     tracing, misfit = report.tracing, report.tracing.misfit
-    support = {} if misfit is None else misfit.support
     instead = {} if misfit is None else misfit.instead
     found = [truth.machine.effect(name) for name in tracing.chosen]
     return {
@@ -70,12 +69,6 @@ def row_of(group: str, kind: Kind, number: int) -> dict[str, object]:
         "named": json.dumps([*named(report)]),
         "helps": json.dumps([*tracing.chosen]),
         "instead": json.dumps({k: [*names] for k, names in instead.items()}),
-        "support": json.dumps(
-            {
-                k: [round(v, 4) for v in (s.inclusion, s.gained, s.remains, s.guessed)]
-                for k, s in support.items()
-            }
-        ),
         **_covered(truth, tracing),
         **cost,
     }
@@ -93,15 +86,7 @@ def _known(truth: Truth) -> dict[str, object]:
         "equivalent": json.dumps(
             sorted(frozenset().union(*[machine.equivalent(n) for n in truth.names]))
         ),
-        "sizes": " ".join(f"{size:.3g}" for size in truth.sizes),
-        "strengths": " ".join(
-            f"{value:.5g}" for phi in truth.strengths for value in phi[0].tolist()
-        ),
         "discrepancy": "" if what is None else what.kind,
-        "detail": "" if what is None else what.detail,
-        "size": truth.size,
-        "excess": truth.excess(),
-        "theta": " ".join(f"{value:.5g}" for value in truth.theta[0].tolist()),
         "held_bare": bare,
         "held_true": truth.held_out_error(truth.effects) if truth.effects else bare,
         "held_single": _singles(truth, truth.effects),

@@ -294,11 +294,6 @@ class Truth(Setup):
         clean = self.clean(trial).flatten()[None] / self.machine.noise_sd
         return float((x - clean).square().mean().sqrt())
 
-    def excess(self) -> float:
-        """Return the root mean square that the bare model leaves of clean readings."""
-        target = self.clean(self.fitted).flatten()[None] / self.machine.noise_sd
-        return float(self.left(target))
-
 
 def _start(effect: Effect, known: Mapping[str, Tensor]) -> Tensor:
     if effect.name in known:

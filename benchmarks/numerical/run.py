@@ -102,24 +102,20 @@ def round_row(
     assert trial.design is not None
     exact, truth = reference(task, campaign.history), task.theta_true
     log_p = float(exact.log_prob(truth[None].double())[0])
-    row, draws = last_round(campaign, truth, STAGES)
+    row, _ = last_round(campaign, truth, STAGES)
     exact_draws = exact.sample(2_000, seed=index)
     exact_log_p = exact.log_prob(exact_draws)
     chosen = trial.design.index
     diagnostics = getattr(belief, "diagnostics", Diagnostics()).to_dict()
     row |= {
         "action": " ".join(f"{v:g}" for v in trial.action.tolist()),
-        "exact_log_prob_true": log_p,
         "gap": log_p - float(belief.log_prob(truth)),
         "kl": float((exact_log_p - belief.log_prob(exact_draws.float())).mean()),
         "exact_hpd": float((exact_log_p > log_p).double().mean()),
-        "mass_positive": float((draws[:, 0] > 0).double().mean()),
-        "chained_loss": diagnostics.get("chained_loss"),
-        "chained_bluntness": diagnostics.get("chained_bluntness"),
         "trustworthy": diagnostics.get("trustworthy"),
     }
     if gain is not None:
-        row |= {"exact_eig": gain[chosen], "regret": gain.max() - gain[chosen]}
+        row["regret"] = gain.max() - gain[chosen]
         row |= {f"rep_err_{a:g}": task.reproduction_error(belief, a) for a in REPORTED}
     return row
 

@@ -2,7 +2,7 @@
 
     python -m benchmarks pouring.bank FOLDER --rows 2300             # 27 actions
     python -m benchmarks pouring.bank FOLDER --part likely --rows 150
-    python -m benchmarks pouring.bank FOLDER --report
+    python -m benchmarks pouring.bank FOLDER --rows 0      # what it holds
 
 A part ``likely`` pours at the actions that designs choose most alone, and is learned
 from as ``prior`` is.
@@ -89,7 +89,6 @@ def filling(
         part: str = parts[0],
         rows: int = num,
         share: str = "0/1",
-        report: bool = False,
     ) -> None:
         """Simulate the files that are missing, and print what the folder holds.
 
@@ -98,11 +97,10 @@ def filling(
             part: Name of the part.
             rows: Number of rows.
             share: Share of the files that is poured, as in 0/2 and 1/2.
-            report: Whether to simulate nothing, and print what the folder holds.
         """
         own, (mine, of) = folder / part, map(int, share.split("/"))
         own.mkdir(parents=True, exist_ok=True)
-        for number in () if report else range(mine, -(-rows // ROWS_A_FILE), of):
+        for number in range(mine, -(-rows // ROWS_A_FILE), of):
             path = own / f"{number:05d}.npz"
             if not path.exists():
                 _pour(path, get_task(name), *draw(get_task(name), part, number))

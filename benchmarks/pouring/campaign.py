@@ -75,7 +75,6 @@ class Round:
         action: Shape (3,).
         image: Shape (22500,).
         gain: Expected gains by delta and action; NaN where nothing was asked.
-        error: Standard errors of these.
         belief: Belief after the trial.
         cpu_design: CPU seconds of the choice.
         cpu_trial: CPU seconds of the trial and the belief.
@@ -87,7 +86,6 @@ class Round:
     action: Tensor
     image: Tensor
     gain: np.ndarray
-    error: np.ndarray
     belief: Any
     cpu_design: float
     cpu_trial: float
@@ -99,7 +97,6 @@ class Round:
             "round": self.index + 1,
             **dict(place),
             "delta": self.delta,
-            "in_view": float((self.image > 0).float().mean()),
             "eig": float(self.gain[self.delta, self.place]),
             "cpu_design": self.cpu_design,
             "cpu_trial": self.cpu_trial,
@@ -136,10 +133,10 @@ def rounds(
     belief, earlier = believed(total), Earlier(list)
     for index in range(num):
         start = time.process_time()
-        gain = error = np.full((2, len(learned.actions)), np.nan)
+        gain = np.full((2, len(learned.actions)), np.nan)
         if is_active:
             own_seed = derive_seed(seed, "gain", index)
-            gain, error = learned.gains(belief, earlier, own_seed)
+            gain = learned.gains(belief, earlier, own_seed)
             choice = int(gain.argmax())
         else:
             with forked_generators(derive_seed(seed, "action", index)):
@@ -153,6 +150,6 @@ def rounds(
         belief = believed(total * (index + 1.0) ** -tempered)
         ended = time.process_time()
         yield Round(
-            *(index, delta, place, action, image, gain, error, belief),
+            *(index, delta, place, action, image, gain, belief),
             *(designed - start, ended - designed),
         )

@@ -80,20 +80,13 @@ def best_power(log_p: Array, own: Array) -> float:
         log_p: Log likelihoods at cells of the prior, or draws from it, shape (n, m).
         own: At the truth, shape (n,).
     """
-    score = [told_by(power * log_p, power * own)[0].mean() for power in POWERS]
+    score = [told_by(power * log_p, power * own).mean() for power in POWERS]
     return float(POWERS[int(np.argmax(score))])
 
 
-def told_by(log_p: Array, own: Array) -> tuple[Array, Array]:
-    """Return log density of the truth, and the mass of what is denser, (n,).
-
-    Args:
-        log_p: At cells of the prior, shape (n, m).
-        own: At the truth, shape (n,).
-    """
-    total: Array = np.asarray(logsumexp(log_p, 1))
-    mass = np.where(log_p > own[:, None], np.exp(log_p - total[:, None]), 0).sum(1)
-    return own - total + np.log(log_p.shape[1]), mass
+def told_by(log_p: Array, own: Array) -> Array:
+    """Return log density of the truth by log p at cells of the prior, (n,)."""
+    return own - np.asarray(logsumexp(log_p, 1)) + np.log(log_p.shape[1])
 
 
 NUM_OUTER, NUM_ALL = 100, 300  # draws behind an expected gain
@@ -110,13 +103,11 @@ class Learned:
 
     Attributes:
         likelihood: Learned from them.
-        num: Pours behind it.
         mean: Of thumbnails, shape (900,), where the summary is components.
         axes: Shape (900, k).
     """
 
     likelihood: ImageLikelihood
-    num: int
     mean: np.ndarray
     axes: np.ndarray
 
@@ -141,13 +132,8 @@ class ByAction:
     actions: Tensor
     inputs: Callable[[np.ndarray, Tensor], np.ndarray] = lambda theta, action: theta
 
-    def gains(
-        self, belief: Any, earlier: Earlier, seed: int
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Return gains by delta and action, nats, and their errors.
-
-        Draws and outcomes are common to all actions.
-        """
+    def gains(self, belief: Any, earlier: Earlier, seed: int) -> np.ndarray:
+        """Return gains by delta and action, nats, on common draws and outcomes."""
         theta = belief.draws(NUM_ALL, seed)
         values = [
             [
@@ -163,7 +149,7 @@ class ByAction:
             ]
             for delta, by_action in enumerate(self.learned)
         ]
-        return np.mean(values, 2), np.std(values, 2) / np.sqrt(NUM_OUTER)
+        return np.mean(values, 2)
 
     def log_likelihood(
         self, theta: np.ndarray, image: Tensor, delta: int, place: int, earlier: Earlier
@@ -217,7 +203,7 @@ def learn(folder: Path, task: Any) -> ByAction:
             found, both_summaries(mesh[mine], small[mine]), strict=True
         ):
             fitted = cross_validated(theta[mine], *one[:2])
-            own.append(Learned(fitted, int(mine.sum()), *one[2:]))
+            own.append(Learned(fitted, *one[2:]))
     return ByAction(found, torch.stack(actions))
 
 

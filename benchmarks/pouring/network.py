@@ -52,19 +52,15 @@ class ByNetwork:
         actions: Shape (27, 3).
         mean: Of thumbnails, shape (900,).
         axes: Of components, shape (900, k).
-        num: Pours behind it.
     """
 
     networks: list[ActionLikelihood]
     actions: Tensor
     mean: np.ndarray
     axes: np.ndarray
-    num: int
 
-    def gains(
-        self, belief: Any, earlier: Earlier, seed: int
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Return gains by delta and action, nats, and their errors, on common draws."""
+    def gains(self, belief: Any, earlier: Earlier, seed: int) -> np.ndarray:
+        """Return gains by delta and action, nats, on common draws."""
         with forked_generators(seed):
             theta = belief.sample(torch.Size([NUM_ALL])).float()
             values = np.array(
@@ -73,7 +69,7 @@ class ByNetwork:
                     for network in self.networks
                 ]
             )
-        return values.mean(2), values.std(2) / np.sqrt(NUM_OUTER)
+        return values.mean(2)
 
     def _gain(
         self, network: ActionLikelihood, theta: Tensor, action: Tensor
@@ -121,4 +117,4 @@ def learn_networks(folder: Path) -> ByNetwork:
             inference = ALHI(task.prior, settings, show_progress_bars=False)
             inference.append_simulations(rows.theta, x, action=rows.action).train()
             networks.append(inference.build_posterior())
-    return ByNetwork(networks, task.actions.values, mean, axes, len(rows))
+    return ByNetwork(networks, task.actions.values, mean, axes)

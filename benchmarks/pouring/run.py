@@ -42,20 +42,13 @@ from benchmarks.rounds import (
     known_truth,
     num_rounds,
 )
-from benchmarks.rows import benchmark, column
+from benchmarks.rows import benchmark, column, published
 from sbi_active.display.table import Table
 from sbi_active.seeding import derive_seed, forked_generators
 from sbi_active.tasks import get_task
 
 #: Section 5.4, read from the text: medians of ASBI after the first and last rounds.
-PUBLISHED = {
-    ("asbi", "1"): "above 1.0 .. over 2.6",
-    ("asbi", "2"): "around 0.8 .. above 3.6",
-    ("nsbi", "1"): "near 0",
-    ("nsbi", "2"): "near 0",
-    ("alhi", "1"): "below -7",
-    ("alhi", "2"): "below -7",
-}
+PUBLISHED = published("pouring")
 
 
 def summarize(cells: Cells) -> str:
@@ -79,7 +72,7 @@ def summarize(cells: Cells) -> str:
                 str(len(last)),
                 " / ".join(f"{np.median(v):.2f}" for v in log_probs),
                 f"{last.min():.2f} .. {last.max():.2f}",
-                PUBLISHED.get((method, target), "-"),
+                *PUBLISHED.get(f"{method} {target}", "-"),
                 f"{by_round(rows, 'power')[-1].mean():.2f}".replace("nan", "-"),
                 f"{seconds:.0f}",
             ]
@@ -159,15 +152,12 @@ def rows_of(
             draws = found.belief.sample(torch.Size([NUM_DRAWS]))
         row = found.row() | known_truth(found.belief, task.theta_true, draws)
         row |= {
-            "eig_se": float(found.error[found.delta, found.place]),
             "eig_pca": float(found.gain[0].max()),
             "eig_mesh": float(found.gain[1].max()),
-            "num_rows": learned.num if isinstance(learned, ByNetwork) else 0,
             "power": np.nan,
         }
         if isinstance(learned, ByAction):
-            own = learned.learned[found.delta][found.place]
-            row |= {"num_rows": own.num, "power": own.likelihood.power}
+            row["power"] = learned.learned[found.delta][found.place].likelihood.power
         rows.append(row)
     return rows
 

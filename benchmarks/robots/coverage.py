@@ -51,7 +51,7 @@ LIBRARY = ("* friction loss", "* quadratic damping", "* quadratic stiffness")
 Intervals = dict[str, tuple[float, float]]
 
 
-def by_sysid(own: Set) -> tuple[Intervals, str, str]:
+def by_sysid(own: Set) -> Intervals:
     """Return the intervals of ``mujoco.sysid``."""
     from mujoco import sysid  # pyright: ignore
 
@@ -64,17 +64,17 @@ def by_sysid(own: Set) -> tuple[Intervals, str, str]:
     _, half = sysid.calculate_intervals(left, np.asarray(found.jac), alpha=1 - LEVEL)
     names = [name for name in params.keys()]  # noqa: C416, SIM118
     each = zip(names, x, np.asarray(half), strict=True)
-    return {n: (float(v - h), float(v + h)) for n, v, h in each}, "", ""
+    return {n: (float(v - h), float(v + h)) for n, v, h in each}
 
 
-def by_us(own: Set, seed: int, *, bare: bool = False) -> tuple[Intervals, str, str]:
+def by_us(own: Set, seed: int, *, bare: bool = False) -> Intervals:
     """Return our intervals."""
     robot = from_sysid(own.sequences, own.params)
     belief = identify_robot(robot, beside=() if bare else None, seed=seed)
-    return belief.interval(LEVEL), "", " | ".join(belief.diagnostics.warnings)
+    return belief.interval(LEVEL)
 
 
-def by_loop(own: Set, seed: int) -> tuple[Intervals, str, str]:
+def by_loop(own: Set, seed: int) -> Intervals:
     """Return the intervals beside the effects that the loop finds."""
     robot: Robot = from_sysid(own.sequences, own.params)
     assert robot.trials is not None
@@ -94,8 +94,7 @@ def by_loop(own: Set, seed: int) -> tuple[Intervals, str, str]:
     belief = identify(report.simulator, report.prior, robot.trials, seed=seed)
     every = belief.interval(LEVEL)
     names = robot.simulator.parameter_names or ()
-    words = " | ".join(belief.diagnostics.warnings)
-    return {name: every[name] for name in names}, report.verdict, words
+    return {name: every[name] for name in names}
 
 
 def rows_of(machine: str, condition: str, seed: int, way: str) -> list[dict[str, Any]]:
@@ -103,15 +102,15 @@ def rows_of(machine: str, condition: str, seed: int, way: str) -> list[dict[str,
     own = recorded(MACHINES[machine], condition, seed)
     start = time.process_time()
     if way == "sysid":
-        found, verdict, words = by_sysid(own)
+        found = by_sysid(own)
     elif way == "loop":
-        found, verdict, words = by_loop(own, seed)
+        found = by_loop(own, seed)
     else:
-        found, verdict, words = by_us(own, seed, bare=way == "bare")
+        found = by_us(own, seed, bare=way == "bare")
     spent = round(time.process_time() - start, 3)
-    told = {"cpu_seconds": spent, "verdict": verdict, "warned": words}
     return [
-        {"parameter": name, "truth": truth, "low": low, "high": high} | told
+        {"parameter": name, "truth": truth, "low": low, "high": high}
+        | {"cpu_seconds": spent}
         for (name, (low, high)), truth in zip(found.items(), own.truth, strict=True)
     ]
 

@@ -46,6 +46,7 @@ from benchmarks.rows import benchmark, column, grouped
 from sbi_active import DiscreteActions, InformationGainDesigner, MixedActions
 from sbi_active.actions import SignalActions
 from sbi_active.criticism import Trials, identify
+from sbi_active.display.table import Table
 from sbi_active.mujoco import MotionLimits, from_mjcf
 from sbi_active.mujoco.models.spec import mujoco
 from sbi_active.mujoco.robot import Robot
@@ -256,11 +257,10 @@ def score(name: str, case: int) -> list[dict[str, object]]:
 
 def summary(rows: Sequence[Mapping[str, str]]) -> str:
     """Return the table: deviations beside those of the chirps."""
-    lines = [
-        "| machine | cases | signals | s | deviations, of the chirps' in 60 s: median, "
-        "largest | deviations at most the chirps' | 90 % intervals that cover | CPU s |"
-    ]
-    lines.append("|---" * 8 + "|")
+    header = ["machine", "cases", "signals", "s"]
+    header += ["deviations, of the chirps' in 60 s: median, largest"]
+    header += ["deviations at most the chirps'", "90 % intervals that cover", "CPU s"]
+    lines = []
     base = {
         (r["machine"], r["case"]): np.array(json.loads(r["sds"]))
         for r in rows
@@ -271,13 +271,11 @@ def summary(rows: Sequence[Mapping[str, str]]) -> str:
         some = groups[name, arm, seconds]
         ratio = np.array([json.loads(r["sds"]) / base[name, r["case"]] for r in some])
         inside = sum(int(r["covered"]) for r in some)
-        lines.append(
-            f"| {name} | {len(some)} | {arm} | {float(seconds):g} | "
-            f"{np.median(ratio):.2f}, {ratio.max():.2f} | "
-            f"{int((ratio <= 1).sum())} of {ratio.size} | "
-            f"{inside} of {ratio.size} | {np.median(column(some, 'cpu_seconds')):.0f} |"
-        )
-    return "\n".join(lines)
+        sizes = f"{np.median(ratio):.2f}, {ratio.max():.2f}"
+        held = (f"{n} of {ratio.size}" for n in (int((ratio <= 1).sum()), inside))
+        cost = f"{np.median(column(some, 'cpu_seconds')):.0f}"
+        lines.append((name, len(some), arm, f"{float(seconds):g}", sizes, *held, cost))
+    return Table(header, lines).markdown()
 
 
 main = benchmark(RESULT, score, summary, machine=MACHINES, case=range(2000, 2005))

@@ -22,7 +22,6 @@ their files, and the Go2's MJCF as in :mod:`.machines`.
 
 from __future__ import annotations
 
-import json
 import time
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -217,9 +216,7 @@ def run_case(name: str, kind: str, seed: int) -> dict[str, object]:
     return row | {
         "verdict": tracing.verdict,
         "alarm": int(loop.detect().alarm),
-        "p_verdict": tracing.probabilities.get(tracing.verdict, 0.0),
         "p_effect": tracing.inclusion.get(str(wanted), 0.0),
-        "stated": json.dumps(sorted(stated - {tracing.verdict})),
         "right": int(right),
         "simulated_trials": count(),
         "cpu_seconds": time.process_time() - begin,

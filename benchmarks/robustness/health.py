@@ -124,8 +124,7 @@ def run_campaign(q: int, lost: str, index: int) -> dict[str, Any]:
         else:
             run.tell(x)
         run.update()
-    row: dict[str, Any] = {"simulator": truth.__name__}
-    untested = 0
+    row, untested = {}, 0
     for trial in run.history:
         for name in ("surprise", "misfit"):
             p = getattr(trial, name)

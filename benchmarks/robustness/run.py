@@ -8,7 +8,7 @@ What was tried has become tests: an attack is a test function of an area, and a 
 what it is called with. A case is survived where the library gives the right numbers, or
 the error that names the fault. No test is counted twice.
 
-An area that has rows is not run again; ``--fresh`` runs it anew.
+An area is run anew; ``--summary`` prints the committed rows alone.
 """
 
 from __future__ import annotations
@@ -81,12 +81,11 @@ def by_tests(patterns: tuple[str, ...]) -> Iterator[dict[str, object]]:
             }
 
 
-def run(area: str, *, fresh: bool) -> None:
-    """Run the tests of an area that has no rows yet."""
+def run(area: str) -> None:
+    """Run the tests of an area anew."""
     path = RESULTS / f"{area}.csv"
-    if fresh:
-        path.unlink(missing_ok=True)
-    for row in () if rows_of(area) else by_tests(AREAS[area]):
+    path.unlink(missing_ok=True)
+    for row in by_tests(AREAS[area]):
         append(path, [row])
         word = "survived" if row["survived"] else f"NOT: {row['answer']}"
         print(f"{area}: {row['attack']} [{row['case']}]: {word}", flush=True)
@@ -111,17 +110,15 @@ def table() -> Iterator[str]:
 def main(
     *,
     area: Annotated[str | None, AREAS] = None,
-    fresh: bool = False,
     summary: bool = False,
 ) -> None:
-    """Run what is missing and print the table.
+    """Run the tests and print the table.
 
     Args:
         area: Name of the area; all by default.
-        fresh: Whether to run all cases again.
         summary: Whether to run nothing, and print the table of the rows.
     """
     areas = (area,) if area else (*AREAS,)
     for name in () if summary else areas:
-        run(name, fresh=fresh)
+        run(name)
     print("\n".join(table()))

@@ -61,16 +61,12 @@ def run_tests(root: Path, files: Sequence[str], *, swap: bool) -> dict[str, str]
     return outcomes
 
 
-def main(*, files: Sequence[str] | None = None) -> None:
-    """Run what is asked for and is not there yet, and print the table.
-
-    Args:
-        files: Names of the test files; all by default.
-    """
+def main() -> None:
+    """Run all with and without the class swapped, and print what differs."""
     with tempfile.TemporaryDirectory() as folder:
         root = fetch_tests(Path(folder))
         every = sorted((root / "tests").glob("*_test.py"))
-        chosen = files or [
+        chosen = [
             f"tests/{path.name}"
             for path in every
             if USES_NPE.search(path.read_text()) and path.name != "tutorials_test.py"

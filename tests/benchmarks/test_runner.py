@@ -20,11 +20,10 @@ def test_options_are_arguments():
         *,
         summary: bool = False,
         seeds: list[int] | None = None,
-        first_seed: int = 3,
         path: Path = ROOT,
         kind: Literal["a", "b"] | None = None,
         names: Annotated[Sequence[str], {"x": 1, "y": 2}] = ("x",),
-        pair: tuple[int, int] = (1, 2),
+        first_pair: tuple[int, int] = (1, 2),
     ) -> None:
         """Run.
 
@@ -33,28 +32,12 @@ def test_options_are_arguments():
         """
 
     parse = parser_of(run, "some").parse_args
-    assert vars(parse([])) == {
-        "summary": False,
-        "seeds": None,
-        "first_seed": 3,
-        "path": ROOT,
-        "kind": None,
-        "names": ("x",),
-        "pair": (1, 2),
-    }
-    options = "--summary --seeds 1 2 --path a --first-seed 4 --kind b --names y x"
-    options += " --pair 3 4"
-    given = parse(options.split())
-    assert vars(given) == {
-        "summary": True,
-        "seeds": [1, 2],
-        "first_seed": 4,
-        "path": Path("a"),
-        "kind": "b",
-        "names": ["y", "x"],
-        "pair": [3, 4],
-    }
-    for wrong in ("--seeds one", "--kind c", "--names z", "--pair 1"):
+    assert vars(parse([])) == run.__kwdefaults__
+    options = "--summary --seeds 1 2 --path a --kind b --names y x --first-pair 3 4"
+    given = {"summary": True, "seeds": [1, 2], "path": Path("a"), "kind": "b"}
+    given |= {"names": ["y", "x"], "first_pair": [3, 4]}
+    assert vars(parse(options.split())) == given
+    for wrong in ("--seeds one", "--kind c", "--names z", "--first-pair 1"):
         with pytest.raises(SystemExit):
             parse(wrong.split())
 
@@ -138,14 +121,9 @@ def test_readme_shows_the_rows_and_no_value_is_missed():
 @pytest.mark.parametrize("way", ["least = { ratio = 1e3 }", "most = { ratio = 1 }"])
 def test_a_missed_value_is_said_and_is_a_failure(tmp_path, monkeypatch, capsys, way):
     stated = tmp_path / "stated.toml"
-    text = """
-[[row]]
-figures = "training"
-what = "training"
-result = "{ratio:.0f}"
-beside = ""
-"""
-    stated.write_text(text + way)
+    row = ("figures", "training"), ("what", "training"), ("result", "{ratio:.0f}")
+    lines = [f'{key} = "{value}"' for key, value in (*row, ("beside", ""))]
+    stated.write_text("\n".join(["[[row]]", *lines, way]))
     monkeypatch.setattr(readme.table, "__defaults__", (stated,))
     assert main(["table", "readme"]) == 1
     printed = capsys.readouterr()

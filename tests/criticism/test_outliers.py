@@ -6,9 +6,8 @@ from sbi.utils import BoxUniform
 from torch.distributions import Independent, Normal
 
 from sbi_active import DiscreteActions, GaussianNoise, SimulatorModel, StudentTNoise
-from sbi_active.criticism import Criticism, Effect, Trials, close_loop
+from sbi_active.criticism import Criticism, Effect, Trials
 from sbi_active.criticism.steps.tracing import credible_set
-from tests.criticism.report.reports import flat, report
 
 PRIOR = BoxUniform(-5 * torch.ones(2), 5 * torch.ones(2))
 ACTIONS = DiscreteActions(torch.arange(-5, 5.5, 0.5))
@@ -43,18 +42,15 @@ def criticism(x, *, xi=XI, model=MODEL, **options):
 def test_a_gross_error_is_named_by_the_trial_s_own_index(size):
     x = measured()
     x[7] += size
-    index = torch.arange(8) + 11
-    loop = criticism(x, index=index)
+    loop = criticism(x, index=torch.arange(8) + 11)
     found = loop.trace()
     assert found.verdict == "outlier"
     assert found.chosen == ()
     assert credible_set(found.outliers) == (18.0,)
     assert sum(found.probabilities.values()) == pytest.approx(1.0)
     made = loop.report(evaluate=False, plan=False)
-    assert str(made).startswith("Verdict: outlier (P ")
     assert "trial 18" in str(made).splitlines()[0]
-    assert "outlier: trial 18" in flat(made)
-    assert any("check its record" in warning for warning in made.warnings)
+    assert "SA521" in [w.code for w in made.warnings]
     assert made.simulator is loop.model
     theta = made.parameters.set_index("parameter")["after"]
     assert abs(theta["theta_2"] + 2.0) < 0.6  # without the trial
@@ -83,12 +79,9 @@ def test_a_slip_along_a_trajectory_is_an_outlier_and_no_process(num, wrong):
 def test_what_nothing_explains_ends_no_loop(wrong):
     x = measured()
     x[2] = 100 * x[2] if wrong == "unit" else wrong
-    trials = Trials(XI, x)
-    made = close_loop(
-        MODEL, PRIOR, trials, effects=[QUADRATIC], evaluate=False, plan=False
-    )
-    assert made.verdict == "outlier"
-    assert credible_set(made.tracing.outliers) == (2.0,)
+    found = criticism(x).trace()
+    assert found.verdict == "outlier"
+    assert credible_set(found.outliers) == (2.0,)
 
 
 def test_a_true_effect_stays_named_beside_the_outlier():
@@ -116,31 +109,20 @@ def test_without_an_alarm_no_trial_is_suspected():
     assert found.outliers == {}
 
 
-def test_noise_declared_too_large_is_said():
+@pytest.mark.parametrize("noise", [GaussianNoise(100.0), StudentTNoise(100.0, 4.0)])
+def test_noise_declared_too_large_is_seen(noise):
     x = measured()
-    large = SimulatorModel(response, noise=GaussianNoise(100.0))
-    detection = criticism(x, model=large).detect()
-    assert detection.lower_p_value < 1e-4
-    said = report(detection=detection).warnings
-    (sentence,) = (w for w in said if w.code == "SA523")
-    assert "far smaller than the declared noise allows" in sentence
-    larger = SimulatorModel(response, noise=GaussianNoise(1e4))
-    ratio = criticism(x, model=larger).detect().chi_square
-    ratio /= detection.chi_square  # of the same least squares
-    assert ratio == pytest.approx(1e-4, rel=1e-2)
-    assert "declare the error of the measurement" in sentence
-    right = criticism(x).detect()
-    assert right.lower_p_value > 0.01
-    assert "SA523" not in [w.code for w in report(detection=right).warnings]
+    found = criticism(x, model=SimulatorModel(response, noise=noise)).detect()
+    assert found.lower_p_value < 1e-4
+    assert criticism(x).detect().lower_p_value > 0.01
 
 
-def test_large_t_noise_and_trajectories_are_looked_at_as_well():
-    student = SimulatorModel(response, noise=StudentTNoise(100.0, 4.0))
-    assert criticism(measured(), model=student).detect().lower_p_value < 1e-4
+def test_noise_declared_too_large_is_seen_along_trajectories():
     times = torch.linspace(0, 1, 12)
-    noise = GaussianNoise(10.0)
     line = SimulatorModel(
-        lambda theta, xi: theta[:, :1] * times, noise=noise, sample_times=times
+        lambda theta, xi: theta[:, :1] * times,
+        noise=GaussianNoise(10.0),
+        sample_times=times,
     )
     prior = BoxUniform(-torch.ones(1), torch.ones(1))
     x = 0.5 * times + 0.1 * torch.randn(4, 12, generator=torch.manual_seed(0))

@@ -80,9 +80,9 @@ class Judged:
     region: float
     evidence: float
 
-    def faults(self, limits: Limits | None = None) -> list[str]:
+    def faults(self) -> list[str]:
         """Return what is wrong, by name; nothing where all holds."""
-        most = limits or Limits()
+        most = Limits()
         off = {
             "kl": not self.kl <= most.kl,
             "shift": not self.shift <= most.shift,
@@ -92,19 +92,15 @@ class Judged:
         return [name for name, is_off in off.items() if is_off]
 
 
-def judged(
-    own: Problem, answer: Answer, found: Found, limits: Limits | None = None
-) -> Judged:
-    """Return the error of what was found.
+def judged(own: Problem, answer: Answer, found: Found) -> Judged:
+    """Return the error of what was found, a standard error of .05 granted to evidence.
 
     Args:
         own: The problem.
         answer: What is known of it.
         found: What a way says.
-        limits: Give the least standard error of an evidence.
     """
-    theta, most = found.theta, limits or Limits()
-    sd = np.sqrt(np.diag(answer.cov))
+    theta, sd = found.theta, np.sqrt(np.diag(answer.cov))
     label = own.region(theta)
     apart, within = [0.0], [divergence(answer.mean, answer.cov, theta)]
     for k, region in answer.regions.items():
@@ -115,7 +111,7 @@ def judged(
     apart.append(float((~np.isin(label, [*answer.regions])).mean()))
     evidence = np.nan
     if found.log_evidence is not None:
-        error = np.linalg.norm([max(found.error, most.least), answer.error])
+        error = np.linalg.norm([max(found.error, Limits.least), answer.error])
         evidence = (found.log_evidence - answer.log_evidence) / error
     ratio = theta.std(0) / sd
     return Judged(

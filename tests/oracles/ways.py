@@ -58,11 +58,6 @@ class Way:
 WAYS: dict[str, Way] = {}
 
 
-def always(own: Problem) -> bool:
-    """Return True."""
-    return True
-
-
 def declared(own: Problem) -> bool:
     """Return whether the library has the noise."""
     return own.error.declared() is not None
@@ -115,20 +110,13 @@ def in_campaign(**options: Any) -> Run:
     Args:
         options: Of the campaign, and its method.
     """
+    method = options.pop("method", "asbi")
 
     def run(own: Problem, simulator: SimulatorModel, seed: int) -> Found:
-        method = options.get("method", "asbi")
-        given = {k: v for k, v in options.items() if k != "method"}
         low, high = own.action.min(0), own.action.max(0)
         space = BoxActions(low.tolist(), (high + (high <= low)).tolist())
-        campaign = Campaign(
-            simulator,
-            own.prior,
-            space,
-            method=method,
-            options=CampaignOptions(**given),
-            seed=seed,
-        )
+        given = {"method": method, "options": CampaignOptions(**options), "seed": seed}
+        campaign = Campaign(simulator, own.prior, space, **given)
         for action, x in zip(*trials_of(own), strict=True):
             campaign.attach(action, x)
         return found(campaign.update())
@@ -143,7 +131,7 @@ SMALL: dict[str, Any] = {
 }
 
 WAYS["refine"] = Way(refined, declared)
-WAYS["refine, noise drawn"] = Way(refined, always, is_declared=False)
+WAYS["refine, noise drawn"] = Way(refined, lambda own: True, is_declared=False)
 WAYS["campaign"] = Way(
     in_campaign(
         network="on demand",

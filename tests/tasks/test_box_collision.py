@@ -1,10 +1,12 @@
 """The scene of colliding boxes, its effects, and its reference."""
 
 import math
+from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 
 import pytest
 import torch
+from torch.distributions import Normal
 
 from sbi_active import GaussianNoise, SimulatorModel, simulate
 from sbi_active.criticism import AugmentedSimulator
@@ -14,11 +16,6 @@ from sbi_active.tasks.box_collision.model import positions
 from sbi_active.tasks.box_collision.scene import LocalScene
 
 pytest.importorskip("mujoco")
-
-
-@pytest.fixture(scope="module")
-def task():
-    return get_task("box_collision")
 
 
 def rows(num, seed=0):
@@ -49,31 +46,20 @@ def test_early_exit_keeps_the_outcome():
     assert 25 < num_left < 80
 
 
-def test_observations_are_bit_identical(task):
+def test_observations_are_bit_identical():
     theta, action = rows(60)
-    x = simulate(task.simulator, theta, action, seed=3).x
+    x = simulate(TASK.simulator, theta, action, seed=3).x.nan_to_num()
     again = simulate(get_task("box_collision").simulator, theta, action, seed=3).x
-    one_by_one = simulate(task.simulator, theta, action, seed=3, batch_size=7).x
+    few = simulate(TASK.simulator, theta, action, seed=3, batch_size=7).x
+    for other in (again, few):
+        assert torch.equal(x, other.nan_to_num())
     order = torch.randperm(60, generator=torch.Generator().manual_seed(0))
-    mean = task.simulator.mean(theta, action)
-    assert torch.equal(mean[order].nan_to_num(), permuted(task, theta, action, order))
-    for other in (again, one_by_one):
-        assert torch.equal(x.nan_to_num(), other.nan_to_num())
-
-
-def permuted(task, theta, action, order):
-    return task.simulator.mean(theta[order], action[order]).nan_to_num()
-
-
-def test_threads_have_a_scene_each(task):
-    from concurrent.futures import ThreadPoolExecutor
-
-    theta, action = rows(40)
-    alone = task.simulator.mean(theta, action).nan_to_num()
-    with ThreadPoolExecutor(2) as pool:
-        parts = [(theta, action)] * 4
-        for x in pool.map(lambda part: task.simulator.mean(*part), parts):
-            assert torch.equal(x.nan_to_num(), alone)
+    mean = TASK.simulator.mean(theta, action).nan_to_num()
+    turned = TASK.simulator.mean(theta[order], action[order]).nan_to_num()
+    assert torch.equal(mean[order], turned)
+    with ThreadPoolExecutor(2) as pool:  # a scene each
+        for own in pool.map(lambda _: TASK.simulator.mean(theta, action), range(4)):
+            assert torch.equal(own.nan_to_num(), mean)
 
 
 def test_the_paper_s_code_for_what_left_the_table():
@@ -84,8 +70,6 @@ def test_the_paper_s_code_for_what_left_the_table():
     with pytest.raises(ValueError, match="expected a simulator with noise"):
         simulate(task.simulator, theta, action, seed=0, check_noise=True)
 
-
-pytest.importorskip("mujoco")
 
 TASK = get_task("box_collision")
 EFFECTS = {effect.name: effect for effect in TASK.effects()}
@@ -108,25 +92,17 @@ SIGNS = {
 }
 
 
-def evaluate(name, phi, theta, action):
-    simulator = AugmentedSimulator(TASK.simulator, [EFFECTS[name]])
-    return simulator.evaluate(theta, {name: phi}, action)
-
-
 @pytest.mark.parametrize("name", EFFECTS)
 def test_moves_the_cube_as_it_should(name):
     strength, axis, sign = SIGNS[name]
     theta, action = torch.full((1, 3), 0.2), torch.tensor([[5.0]])
-    wide = SimulatorModel(
-        positions, noise=GaussianNoise(TASK.noise), setup=partial(LocalScene, edge=10.0)
-    )
-    simulator = AugmentedSimulator(wide, [EFFECTS[name]])
-    x = simulator.evaluate(theta, {name: torch.full((1, 1), strength)}, action)
+    setup = partial(LocalScene, edge=10.0)
+    wide = SimulatorModel(positions, noise=GaussianNoise(TASK.noise), setup=setup)
+    phi = {name: torch.full((1, 1), strength)}
+    x = AugmentedSimulator(wide, [EFFECTS[name]]).evaluate(theta, phi, action)
     shift = float((x - wide.mean(theta, action))[0, axis])
     assert sign * shift > TASK.noise  # a shift that one trial can show
 
-
-pytest.importorskip("mujoco")
 
 SD = 0.02
 
@@ -144,47 +120,33 @@ MODEL = SimulatorModel(slide, noise=GaussianNoise(SD))
 TRUTH = torch.tensor([[0.6, 0.5, 0.4]])
 
 
-def trials(*speeds):
-    action = torch.tensor(speeds)[:, None]
-    seeds = torch.arange(len(speeds))
-    return action, MODEL(TRUTH.expand(len(speeds), 3), action, seeds)
-
-
 def log_likelihood(theta, action, x):
     """Written anew, trial by trial."""
     total = torch.zeros(len(theta), dtype=torch.float64)
     for xi, observed in zip(action, x, strict=True):
         mean = slide(theta, xi.expand(len(theta), 1))
-        off = mean[:, 0].isnan()
-        if observed.isnan().all():
-            total = total.where(off, -torch.inf)
-        else:
-            z = (observed - mean) / SD
-            log_density = (-0.5 * z**2 - math.log(SD * math.sqrt(2 * math.pi))).sum(-1)
-            total = (total + log_density).where(~off, -torch.inf)
+        off, lost = mean[:, 0].isnan(), bool(observed.isnan().all())
+        log_p = Normal(mean.nan_to_num(), SD).log_prob(observed.nan_to_num()).sum(-1)
+        total = (total + (0.0 if lost else log_p)).where(off == lost, -torch.inf)
     return total
-
-
-def grid(num):
-    middle = (torch.arange(num, dtype=torch.float64) + 0.5) / num
-    return torch.cartesian_prod(middle, middle, middle)
 
 
 @pytest.mark.parametrize("speeds", [(3.0, 5.0), (2.0, 4.0, 12.0)])
 def test_agrees_with_a_grid(speeds):
-    action, x = trials(*speeds)
+    action, seeds = torch.tensor(speeds)[:, None], torch.arange(len(speeds))
+    x = MODEL(TRUTH.expand(len(speeds), 3), action, seeds)
     assert bool(x.isnan().any()) == (12.0 in speeds)
     reference = BoxCollisionReference(MODEL, action, x, num_simulations=24_000)
-    theta = grid(100)
+    middle = (torch.arange(100, dtype=torch.float64) + 0.5) / 100
+    theta = torch.cartesian_prod(middle, middle, middle)
     log_weight = log_likelihood(theta, action, x)
-    log_evidence = log_weight.logsumexp(0) - math.log(len(theta))
+    log_evidence = float(log_weight.logsumexp(0)) - math.log(len(theta))
     se = reference.log_evidence_se
     assert 0 < se < 0.05
     # The midpoint rule is off by far less than the draws.
-    assert abs(reference.log_evidence - float(log_evidence)) < 4 * se
-    assert float(reference.log_prob(TRUTH)) == pytest.approx(
-        float(log_likelihood(TRUTH, action, x)[0]) - reference.log_evidence
-    )
+    assert abs(reference.log_evidence - log_evidence) < 4 * se
+    own = float(log_likelihood(TRUTH, action, x)[0]) - reference.log_evidence
+    assert float(reference.log_prob(TRUTH)) == pytest.approx(own)
     weight = log_weight.softmax(0)
     mean = weight @ theta
     sd = (weight @ (theta - mean) ** 2).sqrt()

@@ -140,11 +140,8 @@ def recordings(*trials, rate=5.0):
 
 @pytest.fixture(scope="module")
 def task():
-    trials = [
-        (kp, name, 0.0)
-        for kp in (100.0, 400.0)
-        for name in ("sin_time_square", "lift_and_drop")
-    ]
+    names = ("sin_time_square", "lift_and_drop")
+    trials = [(kp, name, 0.0) for kp in (100.0, 400.0) for name in names]
     return ServoPendulumTask(data=recordings(*trials))
 
 
@@ -182,13 +179,9 @@ def test_a_free_pendulum_keeps_its_energy_without_friction_alone():
 
 def test_effects_vanish_at_zero(task):
     bare = every_trial(task)
-    assert [e.name for e in task.effects()] == [
-        "Coulomb",
-        "load-dependent",
-        "torque-dependent",
-        "viscous",
-    ]
-    for keyword in ("coulomb", "load", "torque", "viscous"):
+    keywords = {"coulomb", "load", "torque", "viscous"}
+    assert len(task.effects()) == len(keywords)
+    for keyword in keywords:
         assert np.array_equal(every_trial(task, **{keyword: 0.0}), bare)
         assert np.abs(every_trial(task, **{keyword: 0.05}) - bare).max() > 0.01
 
@@ -196,31 +189,18 @@ def test_effects_vanish_at_zero(task):
 # Reading what was recorded
 
 
-@pytest.fixture
-def folder(tmp_path):
-    tables = []
-    for i, name in enumerate(("sin_time_square", "lift_and_drop")):
-        time, goal, on, angle = samples(name, 0.1 * i)
-        tables.append(
-            pd.DataFrame(
-                {
-                    "trial": i,
-                    "time_s": time,
-                    "goal_rad": goal,
-                    "torque_enable": on,
-                    "position_rad": angle,
-                }
-            )
-        )
-    pd.concat(tables).to_csv(tmp_path / "samples.csv", index=False)
-    pd.DataFrame(
-        {"trial": [0, 1], "trajectory": ["sin_time_square", "lift_and_drop"], "kp": 100}
-    ).to_csv(tmp_path / "trials.csv", index=False)
-    return tmp_path
-
-
-def test_reading_interpolates_and_finds_when_the_motor_is_off(folder):
-    found = read_recordings(folder)
+def test_reading_interpolates_and_finds_when_the_motor_is_off(tmp_path):
+    names, columns = ["sin_time_square", "lift_and_drop"], ["time_s", "goal_rad"]
+    columns += ["torque_enable", "position_rad"]
+    tables = [
+        pd.DataFrame(dict(zip(columns, samples(name, 0.1 * i), strict=True)))
+        for i, name in enumerate(names)
+    ]
+    every = pd.concat(tables, keys=[0, 1], names=["trial"]).reset_index(level="trial")
+    every.to_csv(tmp_path / "samples.csv", index=False)
+    trials = pd.DataFrame({"trial": [0, 1], "trajectory": names, "kp": 100})
+    trials.to_csv(tmp_path / "trials.csv", index=False)
+    found = read_recordings(tmp_path)
     assert found.angle.shape == (2, 30)
     assert found.times[[0, -1]].tolist() == pytest.approx([0.2, 6.0])
     assert found.angle[1] == pytest.approx(np.full(30, 0.1))
@@ -229,7 +209,5 @@ def test_reading_interpolates_and_finds_when_the_motor_is_off(folder):
     assert np.abs(found.goal[0] - np.sin(middle**2))[2:].max() < 146 * 0.005**2 / 8
     # Off from the first sample at or after 2 s, which is at 2.004 s.
     assert found.enabled[1].sum() * 0.004 == pytest.approx(2.004, abs=1e-9)
-    assert get_task("servo_pendulum", data=folder).actions.values.tolist() == [
-        [100.0, 0.0],
-        [100.0, 1.0],
-    ]
+    actions = get_task("servo_pendulum", data=tmp_path).actions.values
+    assert actions.tolist() == [[100.0, 0.0], [100.0, 1.0]]

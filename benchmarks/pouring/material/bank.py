@@ -2,7 +2,7 @@
 
     python -m benchmarks pouring.material.bank FOLDER --part prior --rows 300
     python -m benchmarks pouring.material.bank FOLDER --part compared --rows 150
-    python -m benchmarks pouring.material.bank FOLDER --report
+    python -m benchmarks pouring.material.bank FOLDER --rows 0
 
 Rows of ``prior`` are shared out by where the bucket stands: half of them at p = 0, two
 fifths at -30 cm, a tenth at 30 cm, from where next to nothing comes into view; a

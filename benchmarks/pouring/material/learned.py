@@ -67,11 +67,6 @@ class PointBelief:
         """Return the prior."""
         return cls(np.zeros(2**LOG_NUM_POINTS))
 
-    @property
-    def effective(self) -> float:
-        """Effective number of points."""
-        return float(np.exp(-log_sum_exp(2 * self.log_weight)))
-
     def draws(self, num: int, seed: int) -> Array:
         """Return draws by a seed, shape (num, 8)."""
         rng = np.random.default_rng(seed)
@@ -132,7 +127,7 @@ def learn(folder: Path) -> ByAction:
             found, both_summaries(mesh[mine], small[mine]), strict=True
         ):
             fitted = cross_validated(theta[mine], action[mine], *one[:2])
-            own[place] = Learned(fitted, int(mine.sum()), *one[2:])
+            own[place] = Learned(fitted, *one[2:])
     actions = task.actions.values
     places = actions[:, 1].tolist()
     return ByAction(

@@ -17,25 +17,16 @@ def trials(inputs, input_times=FINE, **keywords):
     return Trials(None, X, inputs=inputs, input_times=input_times, **keywords)
 
 
-def test_without_actions_the_action_is_a_label():
-    found = trials({"voltage": torch.zeros(2, 11)})
-    assert found.action_is_label
-    assert found.action[:, 0].tolist() == [0, 1]
-    assert found.action_labels == ("trial",)
-    some = found.select([1])
-    assert some.action_is_label
-    assert some.action.tolist() == [[1.0]]
-    own = Trials(torch.ones(2), X, inputs=torch.zeros(2, 11), input_times=FINE)
-    assert not own.action_is_label
-
-
-def test_values_are_held_on_the_finest_grid():
-    found = trials(
-        [[1.0, 2.0, 3.0], [5.0, 6.0, 7.0, 8.0, 9.0]],
-        [[0.0, 0.5, 1.0], [0.25, 0.5, 0.75, 1.0, 1.25]],
+@pytest.mark.parametrize("action", [None, torch.ones(2)])
+def test_without_actions_the_action_is_a_label(action):
+    found = Trials(action, X, inputs=torch.zeros(2, 11), input_times=FINE)
+    assert (
+        found.action_is_label == found.select([1]).action_is_label == (action is None)
     )
-    assert found.input_times.tolist() == [0, 0.25, 0.5, 0.75, 1.0, 1.25]
-    assert found.inputs["input"].tolist() == [[1, 1, 2, 2, 3, 3], [5, 5, 6, 7, 8, 9]]
+    assert found.action[:, 0].tolist() == ([0, 1] if action is None else [1, 1])
+    assert found.repeat_of.tolist() == [-1, 0]
+    other = Trials(action, X, inputs=torch.randn(2, 11), input_times=FINE)
+    assert other.repeat_of.tolist() == [-1, -1]
 
 
 def test_inputs_may_have_clocks_of_their_own():
@@ -58,24 +49,18 @@ def test_jitter_does_not_move_values():
     assert found.inputs["input"].tolist() == [[*range(11)]] * 2
 
 
-def test_a_selection_is_not_resampled_again():
+def test_values_are_held_on_the_finest_grid_and_a_selection_is_not_resampled_again():
     found = trials(
         [[1.0, 2.0, 3.0], [5.0, 6.0, 7.0, 8.0, 9.0]],
         [[0.0, 0.5, 1.0], [0.25, 0.5, 0.75, 1.0, 1.25]],
         role=["fit", "held out"],
         start=torch.tensor([[1.0, 2.0], [3.0, 4.0]]),
     )
+    assert found.input_times.tolist() == [0, 0.25, 0.5, 0.75, 1.0, 1.25]
+    assert found.inputs["input"].tolist() == [[1, 1, 2, 2, 3, 3], [5, 5, 6, 7, 8, 9]]
     assert torch.equal(found.held_out.inputs["input"], found.inputs["input"][1:])
     assert torch.equal(found.held_out.input_times, found.input_times)
     assert found.held_out.start.tolist() == [[3.0, 4.0]]
-
-
-def test_equal_inputs_make_repeats():
-    same = trials(torch.zeros(2, 11))
-    assert same.repeat_of.tolist() == [-1, 0]
-    assert trials(torch.randn(2, 11)).repeat_of.tolist() == [-1, -1]
-    other = Trials(torch.ones(2), X, inputs=torch.randn(2, 11), input_times=FINE)
-    assert other.repeat_of.tolist() == [-1, -1]
 
 
 NAN = torch.zeros(2, 11).index_put(
@@ -121,9 +106,37 @@ def read(rows, header=LONG, **options):
     return Trials.from_csv("trials.csv", **options)
 
 
-def beside(inputs=OTHER, header="trial,time_ms,input_u[V]", x=ROWS_OF_X, **options):
-    write("inputs.csv", inputs, header)
-    return read(x, "trial,time,x_y", inputs="inputs.csv", **options)
+def beside(inputs=OTHER, **options):
+    write("inputs.csv", inputs, "trial,time_ms,input_u[V]")
+    return read(ROWS_OF_X, "trial,time,x_y", inputs="inputs.csv", **options)
+
+
+#: Table, what its inputs and x are, and the code of what is said.
+TABLES = {
+    "rows of inputs alone": (
+        "trial,time_ms,input_u,x_y|a,0,1,0.1|a,10,2,|b,0,1,0.3|b,10,2,",
+        *({"u": [[1, 2]] * 2}, [[0.1], [0.3]], ""),
+    ),
+    "rows of x alone hold the input": (
+        "trial,time_ms,input_u,x_y|a,0,1,0.1|a,10,2,0.3|a,15,,0.2|a,20,4,0.5",
+        *({"u": [[1, 2, 4]]}, [[0.1, 0.3, 0.2, 0.5]], "SA209"),
+    ),
+    "rows of each input alone, of a log of several topics": (
+        "trial,time,input_u,input_v,x_y|a,0,1,,|a,0.1,,5,|a,0.5,,,7|a,1,2,,|a,1.1,,6,"
+        "|a,1.5,,,8",
+        *({"u": [[1, 2, 2]], "v": [[5, 5, 6]]}, [[7, 8]], "SA209"),
+    ),
+}
+
+
+@pytest.mark.parametrize("case", TABLES)
+def test_inputs_of_a_table(case, recwarn):
+    table, inputs, x, code = TABLES[case]
+    header, *rows = table.split("|")
+    found = read(rows, header)
+    assert {k: v.tolist() for k, v in found.inputs.items()} == inputs
+    assert found.x.tolist() == x
+    assert "".join(getattr(w.message, "code", "") for w in recwarn) == code
 
 
 def test_inputs_stand_beside_x():
@@ -132,38 +145,7 @@ def test_inputs_stand_beside_x():
     assert trials.inputs["voltage"].tolist() == [[1, 2], [3, 4]]
     assert trials.input_labels == ("voltage [V]",)
     assert trials.input_times.tolist() == [0, 0.1]
-    assert isinstance(trials.start, dict)
     assert trials.start["angle"].tolist() == [0.5, 0.7]
-
-
-def test_rows_of_inputs_alone_are_no_samples(recwarn):
-    rows = ["a,0,1,0.1", "a,10,2,", "a,20,3,0.2", "a,30,4,"]
-    more = ["b,0,1,0.3", "b,10,2,", "b,20,3,0.4", "b,30,4,"]
-    trials = read([*rows, *more], "trial,time_ms,input_u,x_y")
-    assert trials.x.tolist() == [[0.1, 0.2], [0.3, 0.4]]
-    assert trials.sample_times.tolist() == [[0, 0.02]] * 2
-    assert trials.inputs["u"].tolist() == [[1, 2, 3, 4]] * 2
-    assert not [w for w in recwarn if "no number" in str(w.message)]
-
-
-def test_rows_of_x_alone_hold_the_input():
-    rows = ["a,0,1,0.1", "a,10,2,0.3", "a,15,,0.2", "a,20,4,0.5"]
-    with pytest.warns(UserWarning, match="1 rows of trials.csv .* no input.* row 3"):
-        trials = read([*rows, "b,0,0,1", "b,10,1,2"], "trial,time_ms,input_u,x_y")
-    assert trials.inputs["u"].tolist() == [[1, 2, 4], [0, 1, 1]]
-    assert trials.x.shape == (2, 4)
-
-
-def test_each_input_may_have_rows_of_its_own():
-    """As in a log of several topics, merged by time."""
-    rows = ["a,0,1,,", "a,0.1,,5,", "a,0.5,,,7", "a,1,2,,", "a,1.1,,6,", "a,1.5,,,8"]
-    with pytest.warns(UserWarning, match="2 rows of trials.csv have a measurement"):
-        trials = read(rows, "trial,time,input_u,input_v,x_y")
-    assert trials.input_times.tolist() == [0, 1, 2]
-    assert trials.inputs["u"].tolist() == [[1, 2, 2]]
-    assert trials.inputs["v"].tolist() == [[5, 5, 6]]
-    assert trials.x.tolist() == [[7, 8]]
-    assert trials.sample_times.tolist() == [[0.5, 1.5]]
 
 
 def test_inputs_come_from_another_file_on_their_own_grid():
@@ -178,20 +160,16 @@ def test_inputs_come_from_another_file_on_their_own_grid():
 
 
 @pytest.mark.parametrize(
-    ("rows", "header", "message"),
+    ("rows", "column", "message"),
     [
-        (
-            ["a,0,1,5", "a,1,2,5"],
-            "trial,time,action_u,x_y",
-            "got 1.0 in row 1 and 2.0 in row 2 .* call it input_. if it is commanded",
-        ),
+        (["a,0,1,5", "a,1,2,5"], "action_u", "1.0 in row 1 and 2.0 in row 2 .*input_"),
         (
             ["a,0,1,5", "a,1,1,5", "a,2,1,5", "a,9,1,5", "a,10,1,5"],
-            "trial,time,input_u,x_y",
-            "no value from 2 to 9 for input 'u' of trial a.* fill in",
+            "input_u",
+            "no value from 2 to 9 for input 'u' of trial a",
         ),
     ],
 )
-def test_a_table_with_inputs_that_is_not_understood(rows, header, message):
+def test_a_table_with_inputs_that_is_not_understood(rows, column, message):
     with pytest.raises(ValueError, match=message):
-        read(rows, header)
+        read(rows, f"trial,time,{column},x_y")

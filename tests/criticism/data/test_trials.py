@@ -20,29 +20,14 @@ def test_ragged_trajectories_are_padded_and_masked():
     assert trials.mask.sum(1).tolist() == [3, 5]
 
 
-def test_roles_split_and_keep_indices():
-    trials = Trials([1.0, 2.0, 3.0], [1.0, 2.0, 3.0], role=["fit", "held out", "fit"])
+def test_roles_names_and_places_stay_with_their_trials():
+    role, names = ["fit", "held out", "fit"], ["run 7", "run 9", 12]
+    trials = Trials([1.0, 2.0, 3.0], [1.0, 2.0, 3.0], role=role, names=names)
+    assert trials.names == ("run 7", "run 9", "12")
     assert trials.fit.index.tolist() == [0.0, 2.0]
+    assert trials.fit.names == ("run 7", "12")
     assert trials.held_out.action.tolist() == [[2.0]]
     assert trials[1:].role == ["held out", "fit"]
-
-
-def test_repeats_are_found_and_follow_a_selection():
-    trials = Trials([1.0, 2.0, 1.0], [1.0, 2.0, 3.0])
-    assert trials.repeat_of.tolist() == [-1, -1, 0]
-    assert trials[[2, 0]].repeat_of.tolist() == [1, -1]
-
-
-def test_names_stay_with_their_trials():
-    trials = Trials(
-        [1.0, 2.0, 3.0],
-        [1.0, 2.0, 3.0],
-        role=["fit", "held out", "fit"],
-        names=["run 7", "run 9", 12],
-    )
-    assert trials.names == ("run 7", "run 9", "12")
-    assert trials.fit.names == ("run 7", "12")
-    assert trials.held_out.names == ("run 9",)
     assert trials[[2, 0]].select([1, 1]).names == ("run 7", "run 7")
     assert trials.called([0, 2]) == "trials run 7, 12"
     unnamed = Trials([1.0, 2.0], [1.0, 2.0], index=[4, 1_234_567.0])
@@ -50,10 +35,9 @@ def test_names_stay_with_their_trials():
     assert unnamed[1:].names == ("1234567",)
 
 
-@pytest.mark.parametrize("names", ["ab", ["a"], ["a", "a"], ["a", " "]])
-def test_names_are_one_each(names):
-    with pytest.raises(ValueError, match="expected names of 2 trials, each another"):
-        Trials([1.0, 2.0], [1.0, 2.0], names=names)
+SPEED, STOP = [1.0, 2.0], [[1.0, 2.0], [3.0, 4.0]]
+NAN = float("nan")
+ROLE = ["fit", "held out"]
 
 
 def test_measurements_skip_gaps_within_a_trajectory_alone():
@@ -75,25 +59,26 @@ def test_measurements_order_channels_before_times():
 
 
 @pytest.mark.parametrize(
-    ("arguments", "keywords", "message"),
+    ("changes", "message"),
     [
-        (([1.0, 2.0], [1.0]), {}, "expected actions .* with as many rows"),
-        (([1.0], [np.nan]), {}, "expected at least one valid trial"),
-        (
-            ([1.0, 2.0], [1.0, np.nan]),
-            {"role": ["fit", "held out"]},
-            r"expected measurements in the held-out trials; got NaN in trial 1;",
+        *(
+            ({"names": names}, "expected names of 2 trials, each another")
+            for names in ("ab", ["a"], ["a", "a"], ["a", " "])
         ),
-        (
-            ([1.0, 2.0], np.ones((2, 3))),
-            {"sample_times": [0.0, 1.0]},
-            r"expected sample_times of shape \(3,\)",
-        ),
+        ({"x": [1.0]}, "expected actions .* with as many rows"),
+        ({"x": [NAN, NAN]}, "expected at least one valid trial"),
+        ({"x": [1.0, NAN], "role": ROLE}, "in the held-out trials; got NaN in trial 1"),
+        ({"sample_times": [1.0]}, r"expected sample_times of shape \(2,\)"),
+        ({"x": np.ones((2, 1)) + 1j}, "x of real numbers; got torch.complex128"),
+        ({"index": [0.0, NAN]}, "expected finite places in index"),
+        ({"repeat_of": [-1, 7]}, "expected repeat_of among the positions 0 to 1"),
+        ({"repeat_of": [1, 0]}, "runs in a circle"),
+        ({"mask": [[255, 1], [1, 0]]}, "expected a mask of True and False.*got 255"),
     ],
 )
-def test_bad_trials(arguments, keywords, message):
+def test_bad_trials(changes, message):
     with pytest.raises(ValueError, match=message):
-        Trials(*arguments, **keywords)
+        Trials(**{"action": SPEED, "x": STOP} | changes)
 
 
 def test_joined_trials_have_all_of_both_and_names_of_their_own():
@@ -115,22 +100,11 @@ def test_joined_trials_have_all_of_both_and_names_of_their_own():
 # What trials make of numbers as they come
 
 
-NAN = float("nan")
-SPEED, STOP = [1.0, 2.0], [[1.0, 2.0], [3.0, 4.0]]
-
-
 @pytest.mark.parametrize("kind", [np.array, torch.tensor])
 def test_what_was_given_may_change_afterwards(kind):
-    given = {
-        "action": kind([1.0, 2.0]),
-        "x": kind([[1.0, 2.0], [3.0, 4.0]]),
-        "index": kind([0.0, 1.0]),
-        "sample_times": kind([0.0, 1.0]),
-    }
-    given = {
-        k: v.double() if torch.is_tensor(v) else v.astype(float)
-        for k, v in given.items()
-    }
+    numbers = {"action": SPEED, "x": STOP, "index": SPEED, "sample_times": SPEED}
+    given = {k: torch.tensor(v).double() for k, v in numbers.items()}
+    given = given if kind is torch.tensor else {k: v.numpy() for k, v in given.items()}
     trials = Trials(**given)
     before = {k: v.clone() for k, v in vars(trials).items() if torch.is_tensor(v)}
     for value in given.values():
@@ -139,48 +113,14 @@ def test_what_was_given_may_change_afterwards(kind):
         assert torch.equal(getattr(trials, name), value), name
 
 
-def test_what_a_masked_array_masks_is_not_measured():
-    x = np.ma.masked_array(STOP, mask=[[0, 1], [0, 0]])
-    assert Trials(SPEED, x).mask.tolist() == [[True, False], [True, True]]
-
-
-@pytest.mark.parametrize(
-    "x",
-    [
-        torch.ones(2, 1, requires_grad=True),
-        torch.ones(2, 1, dtype=torch.bfloat16),
-        np.array([[1], [1]], dtype=object),
-    ],
-)
-def test_numbers_of_any_type_are_taken(x):
-    assert Trials(SPEED, x).x.tolist() == [[1.0], [1.0]]
-
-
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"x": np.ones((2, 1)) + 1j}, "x of real numbers; got torch.complex128"),
-        ({"index": [0.0, NAN]}, "expected finite places in index"),
-        ({"repeat_of": [-1, 7]}, "expected repeat_of among the positions 0 to 1"),
-        ({"repeat_of": [1, 0]}, "runs in a circle"),
-        ({"mask": [[255, 1], [1, 0]]}, "expected a mask of True and False.*got 255"),
-    ],
-)
-def test_what_is_no_measurement_is_refused(changes, message):
-    with pytest.raises(ValueError, match=message):
-        Trials(**{"action": SPEED, "x": STOP} | changes)
-
-
-def test_repeats_of_repeats_are_repeats_of_the_first():
-    trials = Trials([1.0] * 4, [1.0, 2.0, 3.0, 4.0], repeat_of=[-1, 0, 1, 3])
-    assert trials.repeat_of.tolist() == [-1, 0, 0, -1]
-
-
-def test_repeats_stay_together_where_the_first_is_left_out():
+def test_repeats_are_found_and_stay_together_where_the_first_is_left_out():
     role = ["held out", "fit", "fit", "fit"]
-    trials = Trials([1.0] * 4, [1.0, 2.0, 3.0, 4.0], role=role)
-    assert trials.fit.repeat_of.tolist() == [-1, 0, 0]
+    trials = Trials([1.0, 1.0, 2.0, 1.0], [1.0, 2.0, 3.0, 4.0], role=role)
+    assert trials.repeat_of.tolist() == [-1, 0, -1, 0]
+    assert trials.fit.repeat_of.tolist() == [-1, -1, 0]
     assert trials[[3, 1]].repeat_of.tolist() == [-1, 0]
+    told = Trials([1.0] * 4, [1.0, 2.0, 3.0, 4.0], repeat_of=[-1, 0, 1, 3])
+    assert told.repeat_of.tolist() == [-1, 0, 0, -1]
 
 
 # Units of headers: one reading of them, for tables and for logs of robots
@@ -213,14 +153,17 @@ def test_what_is_no_scale_of_an_si_unit_is_not_guessed(unit):
     assert to_si(unit) is None
 
 
-@pytest.mark.parametrize("where", ["header", "units"])
-def test_numbers_of_a_table_become_si(where):
+@pytest.mark.parametrize("where", ["header", "units", "folder"])
+def test_numbers_of_a_table_become_si(where, tmp_path):
     names, units = [*UNITS], UNITS
-    if where == "header":
-        names = [f"{name} [{unit}]" for name, unit in UNITS.items()]
-        units = None
-    frame = pd.DataFrame(ROWS, columns=names).assign(trial=1)
-    trials = Trials.from_dataframe(frame, units=units)
+    if where != "units":
+        names, units = [f"{name} [{unit}]" for name, unit in UNITS.items()], None
+    frame = pd.DataFrame(ROWS, columns=names)
+    if where == "folder":
+        frame.to_csv(tmp_path / "run.csv", index=False)
+        trials = Trials.from_csv(tmp_path)
+    else:
+        trials = Trials.from_dataframe(frame.assign(trial=1), units=units)
     assert trials.sample_times.flatten().tolist() == [0, pytest.approx(0.02)]
     assert trials.action.item() == pytest.approx(np.pi)
     assert trials.x.flatten().tolist() == pytest.approx([0.005, -0.002])
@@ -229,40 +172,25 @@ def test_numbers_of_a_table_become_si(where):
     assert trials.channel_labels == ("y [m]",)
 
 
-def test_numbers_of_a_folder_become_si(tmp_path):
-    names = [f"{name} [{unit}]" for name, unit in UNITS.items()]
-    for shift in (1, 2):
-        rows = [(time, v, y + shift, u) for time, v, y, u in ROWS]
-        frame = pd.DataFrame(rows, columns=names)
-        frame.to_csv(tmp_path / f"run_{shift}.csv", index=False)
-    trials = Trials.from_csv(tmp_path)
-    assert trials.x.flatten().tolist() == pytest.approx([0.006, -0.001, 0.007, 0.0])
-    assert trials.channel_labels == ("y [m]",)
-
-
-def logs(scale=1e3, units=("ms", "mm", "mm/s")):
-    """Two logs at 100 Hz, of which the position was read_robot at 10 Hz."""
+def logs(scale=1e3, units=("ms", "mm", "mm/s"), **more):
+    """Two logs at 100 Hz, of which the position was read at 10 Hz."""
     t = np.arange(0, 1, 0.01)
     time, position, speed = (f" [{unit}]" if unit else "" for unit in units)
     slow = np.where(np.arange(100) % 10, np.nan, t)
-    frame = pd.DataFrame(
-        {
-            f"time{time}": scale * t,
-            "push [N]": np.sin(5 * t),
-            f"position{position}": scale * slow,
-            f"speed{speed}": scale * t,
-            f"start slide{position}": 0 * t + scale * 0.1,
-        }
-    )
+    columns = {
+        f"time{time}": scale * t,
+        "push [N]": np.sin(5 * t),
+        f"position{position}": scale * slow,
+        f"speed{speed}": scale * t,
+        f"start slide{position}": 0 * t + scale * 0.1,
+    }
+    frame = pd.DataFrame(columns | more)
     return [frame, frame.assign(**{"push [N]": np.sin(6 * t)})]
 
 
 def read_robot(recordings):
-    robot = from_mjcf(
-        SPRING_MASS, {"cart.mass": (0.5, 2)}, recordings=recordings, noise=0.01
-    )
-    assert robot.trials is not None
-    return robot.trials
+    masses = {"cart.mass": (0.5, 2)}
+    return from_mjcf(SPRING_MASS, masses, recordings=recordings, noise=0.01).trials
 
 
 def test_logs_of_a_robot_become_si_as_tables_do(tmp_path):
@@ -276,24 +204,19 @@ def test_logs_of_a_robot_become_si_as_tables_do(tmp_path):
         found, expected = getattr(converted, name), getattr(same, name)
         assert np.allclose(found, expected, equal_nan=True), name
     assert converted.x[:, :, 0].isfinite().sum() == 20
-    assert isinstance(converted.start, dict)
+
     assert converted.start["slide"].tolist() == pytest.approx([0.1, 0.1])
 
 
 @pytest.mark.parametrize(
-    ("units", "message"),
+    ("changes", "message"),
     [
-        (("ms", "px", ""), r"'position' in m; got \[px\] in the rec"),
-        (("ms", "deg", ""), r"'position' in m; got \[deg\] in the rec"),
-        (("mm", "", ""), r"times in s, .* got mm"),
+        ({"units": ("ms", "px", "")}, r"'position' in m; got \[px\] in the rec"),
+        ({"units": ("ms", "deg", "")}, r"'position' in m; got \[deg\] in the rec"),
+        ({"units": ("mm", "", "")}, r"times in s, .* got mm"),
+        ({"position [m]": 0.0}, "each quantity once; got position .* and"),
     ],
 )
-def test_units_that_cannot_be_those_of_the_model_are_refused(units, message):
-    with pytest.raises(ValueError, match=f"expected {message}"):
-        read_robot(logs(units=units))
-
-
-def test_one_column_in_two_units_is_refused():
-    log = logs()[0].assign(**{"position [m]": 0.0})
-    with pytest.raises(ValueError, match="each quantity once; got position .* and"):
-        read_robot([log])
+def test_units_that_cannot_be_those_of_the_model_are_refused(changes, message):
+    with pytest.raises(ValueError, match=message):
+        read_robot(logs(**changes))

@@ -24,7 +24,7 @@ from sbi_active.criticism import (
 from sbi_active.criticism.effects.declarations import require_nested
 from tests.effects import effect
 
-NAN = float("nan")
+NAN, NORMAL = float("nan"), Normal(0.0, 1.0)
 PRIOR = BoxUniform(-3 * torch.ones(1), 3 * torch.ones(1))
 SPEED = torch.tensor([1.0, 2.0, 3.0, 2.0, 1.5])
 STOP = 0.7 * SPEED + 0.1 * torch.tensor([0.3, -1.2, 0.8, 0.1, -0.4])
@@ -54,36 +54,30 @@ def test_parts_that_are_none_are_refused(changes, message):
 
 
 @pytest.mark.parametrize(
-    ("prior", "null"),
+    ("prior", "null", "is_taken"),
     [
-        (Uniform(1.0, 2.0), 0.0),
-        (HalfNormal(1.0), -0.5),
-        (Uniform(torch.zeros(2), torch.ones(2)), torch.tensor([0.0, 1.5])),
+        (Uniform(1.0, 2.0), 0.0, False),
+        (HalfNormal(1.0), -0.5, False),
+        (Uniform(torch.zeros(2), torch.ones(2)), torch.tensor([0.0, 1.5]), False),
+        (Normal(0.0, 1.0), 0.0, True),
+        (Uniform(-1.0, 0.0), 0.0, True),
+        (LogNormal(0.0, 1.0), 0.0, True),
+        (BoxUniform(torch.zeros(1), torch.ones(1)), 0.0, True),
     ],
 )
-def test_a_prior_that_excludes_its_null_is_refused_where_it_is_declared(prior, null):
+def test_a_prior_allows_its_null_within_or_on_its_edge(prior, null, is_taken):
     def apply(value, phi, action, context):
         return value + (phi - torch.as_tensor(null)).sum(-1, keepdim=True)
 
-    outside = effect(prior=prior, null=null, apply=apply)
+    own = effect(prior=prior, null=null, apply=apply)
+    if is_taken:
+        require_nested([own])
+        return
     message = "expected a prior of effect 'bias' that allows its null"
     with pytest.raises(ValueError, match=message):
-        loop(outside)
+        loop(own)
     with pytest.raises(ValueError, match=message):
-        Campaign(MODEL, PRIOR, ACTIONS, effects=[outside])
-
-
-@pytest.mark.parametrize(
-    "prior",
-    [
-        Normal(0.0, 1.0),
-        Uniform(-1.0, 0.0),
-        LogNormal(0.0, 1.0),
-        BoxUniform(torch.zeros(1), torch.ones(1)),
-    ],
-)
-def test_a_null_within_or_on_the_edge_of_the_support_is_taken(prior):
-    require_nested([effect(prior=prior)])
+        Campaign(MODEL, PRIOR, ACTIONS, effects=[own])
 
 
 def test_infinite_nulls_and_nuisances_need_no_prior_that_allows_them():
@@ -91,11 +85,23 @@ def test_infinite_nulls_and_nuisances_need_no_prior_that_allows_them():
     require_nested([effect(prior=Uniform(1.0, 2.0), scope="trial")])
 
 
-def test_a_null_that_is_kept_may_change_afterwards():
+def test_what_is_kept_may_change_afterwards():
+    """The null that was given, and a view that apply returned of what it keeps."""
     for null in (torch.zeros(1), np.zeros(1)):
         made = effect(null=null)
         null[0] = 5.0
         assert float(made.null_phi(1)) == 0.0
+    kept = torch.zeros(100, 1)
+
+    def apply(x, phi, action, context):
+        kept[: len(x)] = x + phi
+        return kept[: len(x)]
+
+    model = AugmentedSimulator(MODEL, [effect(apply=apply)])
+    theta, action = torch.tensor([[0.5, 1.0]]), torch.ones(1, 1)
+    first = model.mean(theta, action)
+    model.mean(2 * theta, action)
+    assert float(first) == pytest.approx(1.5)
 
 
 def test_an_effect_named_like_a_parameter_would_share_its_row():
@@ -118,28 +124,31 @@ def no_change(value, phi, action, context):
     return None
 
 
+def louder(sd, phi, action, context):
+    sd *= 1.5 + phi  # in place
+    return sd
+
+
 @pytest.mark.parametrize(
-    ("hook", "apply", "message"),
+    ("hook", "apply", "prior", "message"),
     [
-        ("observation", no_change, r"observation of shape \(16, 1\); got NoneType"),
-        ("observation", lambda v, phi, a, c: v + phi[:, 0], r"got \(16, 16\)"),
-        ("action", lambda v, phi, a, c: (v + phi)[:, 0], r"got \(16,\)"),
-        ("noise", lambda v, phi, a, c: phi, "vanish at its null"),
-        ("dynamics", no_change, "return a dict of keyword arguments; got NoneType"),
+        ("observation", no_change, NORMAL, r"of shape \(16, 1\); got NoneType"),
+        ("observation", lambda v, phi, a, c: v + phi[:, 0], NORMAL, r"got \(16, 16\)"),
+        ("action", lambda v, phi, a, c: (v + phi)[:, 0], NORMAL, r"got \(16,\)"),
+        ("dynamics", no_change, NORMAL, "a dict of keyword arguments; got NoneType"),
+        ("noise", lambda v, phi, a, c: phi, NORMAL, "vanish at its null"),
+        ("noise", louder, HalfNormal(1.0), r"the noise changed by up to 0\.5"),
+        (
+            "noise",
+            lambda v, phi, a, c: v * (1 + phi),
+            Normal(0.0, 2.0),
+            "positive; got",
+        ),
     ],
 )
-def test_apply_that_returns_something_else_is_named(hook, apply, message):
+def test_apply_that_returns_something_else_is_named(hook, apply, prior, message):
     with pytest.raises(ValueError, match=f"(?s)effect 'bias'.*{message}"):
-        loop(effect(hook=hook, apply=apply))
-
-
-def test_a_standard_deviation_that_is_not_positive_is_refused():
-    def apply(sd, phi, action, context):
-        return sd * (1 + phi)
-
-    with pytest.raises(ValueError, match="'bias' to keep the noise positive; got -"):
-        loop(effect(hook="noise", prior=Normal(0.0, 2.0), apply=apply))
-    loop(effect(hook="noise", prior=HalfNormal(2.0), apply=apply))
+        loop(effect(hook=hook, apply=apply, prior=prior))
 
 
 def in_place(value, phi, action, context):
@@ -168,36 +177,3 @@ def test_apply_may_change_what_it_gets(hook):
     assert torch.equal(*x.values())
     assert [float(v[0]) for v in given] == pytest.approx([0.5, 2.0, 1.0])
     assert float(phi["bias"][0]) == pytest.approx(0.3)
-
-
-def test_a_wrong_null_shows_where_noise_is_changed_in_place():
-    def apply(sd, phi, action, context):
-        sd *= 1.5 + phi
-        return sd
-
-    with pytest.raises(ValueError, match=r"the noise changed by up to 0\.5"):
-        loop(effect(hook="noise", prior=HalfNormal(1.0), apply=apply))
-
-
-def test_phi_along_the_wrong_axis_shows_where_x_has_as_many_entries_as_rows():
-    wide = SimulatorModel(
-        lambda theta, xi: theta * xi * torch.ones(16), noise=GaussianNoise(0.1)
-    )
-    trials = Trials(SPEED, STOP[:, None] * torch.ones(16))
-    wrong = effect(apply=lambda x, phi, action, context: x + phi[:, 0])
-    with pytest.raises(RuntimeError, match="must match"):
-        Criticism(wide, PRIOR, trials, effects=[wrong])
-
-
-def test_apply_may_return_a_view_of_what_it_keeps():
-    kept = torch.zeros(100, 1)
-
-    def apply(x, phi, action, context):
-        kept[: len(x)] = x + phi
-        return kept[: len(x)]
-
-    model = AugmentedSimulator(MODEL, [effect(apply=apply)])
-    theta, action = torch.tensor([[0.5, 1.0]]), torch.ones(1, 1)
-    first = model.mean(theta, action)
-    model.mean(2 * theta, action)
-    assert float(first) == pytest.approx(1.5)

@@ -55,23 +55,16 @@ EXPECTED = {
 
 
 @pytest.mark.parametrize("hook", HOOKS)
-def test_every_hook_changes_what_it_says(hook):
+def test_every_hook_changes_what_it_says_and_nothing_at_its_null(hook):
     model = AugmentedSimulator(MODEL, [HOOKS[hook]])
-    theta = torch.tensor([[0.5, -0.25, 0.4]])
-    x = model.mean(theta, torch.tensor([[2.0]]))
+    x = model.mean(torch.tensor([[0.5, -0.25, 0.4]]), torch.tensor([[2.0]]))
     assert x.item() == pytest.approx(EXPECTED[hook], abs=1e-6)
     assert model.parameter_names == ["a", "b", HOOKS[hook].name]
-
-
-@pytest.mark.parametrize("hook", HOOKS)
-def test_at_the_null_it_is_the_simulator(hook):
-    model = AugmentedSimulator(MODEL, [HOOKS[hook]])
     theta, action = PRIOR.sample((50,)), ACTIONS.sample((50,), seed=0)
-    both = torch.cat([theta, torch.zeros(50, 1)], -1)
     seeds = torch.arange(50)
-    torch.testing.assert_close(
-        model(both, action, seeds=seeds), MODEL(theta, action, seeds=seeds)
-    )
+    bare = MODEL(theta, action, seeds=seeds)
+    both = torch.cat([theta, torch.zeros(50, 1)], -1)
+    torch.testing.assert_close(model(both, action, seeds=seeds), bare)
 
 
 def test_noise_effects_stretch_the_noise():
@@ -93,12 +86,9 @@ def test_an_effect_that_does_not_vanish_is_named_with_its_size(wrong, size):
     check = PRIOR.sample((16,)), ACTIONS.sample((16,), seed=0)
     with pytest.raises(ValueError, match=f"effect 'bias' to vanish.*up to {size}"):
         AugmentedSimulator(MODEL, [wrong], check=check)
-
-
-def test_without_actions_the_first_call_compares():
-    model = AugmentedSimulator(MODEL, [effect(null=0.5)])
+    later = AugmentedSimulator(MODEL, [wrong])  # the first call compares
     with pytest.raises(ValueError, match="vanish at its null"):
-        model.mean(torch.zeros(3, 3), torch.ones(3, 1))
+        later.mean(torch.zeros(3, 3), torch.ones(3, 1))
 
 
 def test_a_null_at_infinity():
@@ -112,42 +102,26 @@ def test_a_null_at_infinity():
     AugmentedSimulator(MODEL, [saturation], check=check)  # inf * tanh(0) is NaN
 
 
-def test_augmenting_twice_is_augmenting_with_both():
-    one = AugmentedSimulator(MODEL, [HOOKS["action"]])
-    two = AugmentedSimulator(one, [HOOKS["observation"]])
-    both = AugmentedSimulator(MODEL, [HOOKS["action"], HOOKS["observation"]])
-    prior = joint_prior(joint_prior(PRIOR, one.effects), [HOOKS["observation"]])
-    z, action = prior.sample((20,)), ACTIONS.sample((20,), seed=0)
-    assert two.base is MODEL
-    torch.testing.assert_close(two.mean(z, action), both.mean(z, action))
-
-
 def test_the_index_of_a_plain_call_is_the_next_trial():
     drift = effect("drift", apply=lambda x, phi, a, c: x + phi * c.index[:, None])
     model = AugmentedSimulator(MODEL, [drift], next_index=8)
     x = model.mean(torch.tensor([[0.0, 0.0, 0.5]]), torch.zeros(1, 1))
     assert x.item() == pytest.approx(4.0)
-    rows = model.evaluate(
-        torch.zeros(3, 2),
-        {"drift": torch.ones(3, 1)},
-        torch.zeros(3, 1),
-        index=torch.tensor([0.0, 1.0, 5.0]),
-    )
+    given = torch.zeros(3, 2), {"drift": torch.ones(3, 1)}, torch.zeros(3, 1)
+    rows = model.evaluate(*given, index=torch.tensor([0.0, 1.0, 5.0]))
     assert rows[:, 0].tolist() == [0.0, 1.0, 5.0]
 
 
 def test_the_joint_prior_is_the_product():
-    inflation = HOOKS["noise"]
-    joint = joint_prior(PRIOR, [HOOKS["observation"], inflation])
+    joint = joint_prior(PRIOR, [HOOKS["observation"], HOOKS["noise"]])
     z = joint.sample((200,))
     expected = PRIOR.log_prob(z[:, :2]) + Normal(0.0, 1.0).log_prob(z[:, 2])
     expected = expected + HalfNormal(1.0).log_prob(z[:, 3])
     torch.testing.assert_close(joint.log_prob(z), expected)
-    assert joint.event_shape == (4,)
     outside = torch.tensor([[0.0, 2.0, 0.0, 1.0], [0.0, 0.0, 0.0, -1.0]])
     assert joint.log_prob(outside).tolist() == [-math.inf, -math.inf]
     assert joint.support.check(outside).tolist() == [False, False]
-    assert joint.mean.shape == joint.stddev.shape == (4,)
+    assert joint.mean.shape == joint.stddev.shape == joint.event_shape == (4,)
 
 
 def test_effects_of_a_trial_are_drawn_in_every_call_and_add_no_parameter():
@@ -167,13 +141,11 @@ def test_generic_effects_vanish_and_are_scaled_by_noise_and_actions():
     AugmentedSimulator(MODEL, effects, check=check)
     by_name = {e.name: e for e in effects}
     assert {e.family for e in effects} == {"action", "observation"}
-    draws = by_name["bias"].sample(4_000)
-    assert float(draws.std()) == pytest.approx(0.5, abs=4 * 0.5 / math.sqrt(8_000))
-    draws = by_name["action offset"].sample(4_000)
-    assert float(draws.std()) == pytest.approx(0.2, abs=4 * 0.2 / math.sqrt(8_000))
-    assert "dead zone" in by_name
+    for name, sd in (("bias", 0.5), ("action offset", 0.2)):
+        draws = by_name[name].sample(4_000)
+        assert float(draws.std()) == pytest.approx(sd, abs=4 * sd / math.sqrt(8_000))
     one_way = generic_effects(MODEL, DiscreteActions([1.0, 2.0]))
-    assert "dead zone" not in {e.name for e in one_way}
+    assert "dead zone" in {*by_name} - {e.name for e in one_way}
 
 
 def test_an_effect_through_keywords_of_the_simulator():
@@ -181,22 +153,18 @@ def test_an_effect_through_keywords_of_the_simulator():
         return theta * action - torch.as_tensor(air_drag)[..., None] * action**2
 
     drag = Effect.keyword("air drag", prior=Normal(0.0, 1.0), units="1/m")
-    law = Effect.keyword(
-        *("power law", "air_drag", "exponent"),
-        prior=Normal(torch.zeros(2), torch.ones(2)),
-        null=torch.tensor([0.0, 1.0]),
-    )
-    value = {"tilt": 1.0}
+    two = {"prior": Normal(torch.zeros(2), torch.ones(2))}
+    null = torch.tensor([0.0, 1.0])
+    law = Effect.keyword("power law", "air_drag", "exponent", null=null, **two)
     phi, action = torch.tensor([[0.5, 2.0]]), torch.ones(1, 1)
-    changed = law.apply(value, phi, action, Context(torch.zeros(1)))
-    assert {k: float(v) for k, v in changed.items()} == {
-        **{"tilt": 1.0, "air_drag": 0.5, "exponent": 2.0}
-    }
+    changed = law.apply({"tilt": 1.0}, phi, action, Context(torch.zeros(1)))
+    expected = {"tilt": 1.0, "air_drag": 0.5, "exponent": 2.0}
+    assert {k: float(v) for k, v in changed.items()} == expected
     model = AugmentedSimulator(SimulatorModel(fn), [drag])
     x = model(torch.tensor([[3.0, 0.5]]), 2 * action)
     assert float(x) == pytest.approx(3 * 2 - 0.5 * 4)
     with pytest.raises(ValueError, match="expected 2 keywords .* got air_drag"):
-        Effect.keyword("law", "air_drag", prior=Normal(torch.zeros(2), torch.ones(2)))
+        Effect.keyword("law", "air_drag", **two)
 
 
 def test_a_density_leaves_the_global_generator_alone():

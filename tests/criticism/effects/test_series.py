@@ -6,13 +6,10 @@ import numpy as np
 import pytest
 import torch
 from sbi.utils import BoxUniform
-from torch.distributions import HalfNormal, Independent, Normal
 
 from sbi_active import GaussianNoise, SimulatorModel
 from sbi_active.criticism import (
     Context,
-    Criticism,
-    Effect,
     Trials,
     close_loop,
     varying_parameters,
@@ -84,63 +81,52 @@ def test_a_sensor_s_lag_is_that_of_fine_integration(channels):
     times = torch.tensor([0.0, 0.1, 0.25, 0.3, 0.7, 1.0]).double()
     x, tau = random(2, 6, *channels), column(0.05, 0.4)
     found = lagged_samples(x, tau, times.expand(2, -1))
-    fine = np.linspace(0, 1, 100_001)
+    fine = np.linspace(0, 1, 10_001)
     for row in range(2):
         for c in np.ndindex(*channels):
             truth = np.interp(fine, times.numpy(), x[row][(slice(None), *c)].numpy())
             y, path = truth[0], []
-            keep = np.exp(-1e-5 / float(tau[row]))
+            keep = np.exp(-1e-4 / float(tau[row]))
             for value in truth:
                 y = keep * y + (1 - keep) * value
                 path.append(y)
             expected = np.interp(times.numpy(), fine, path)
             own = found[row][(slice(None), *c)].numpy()
-            assert own == pytest.approx(expected, abs=1e-3)
+            assert own == pytest.approx(expected, abs=4e-3)
+    # Padding is no number, and costs none.
+    padded = [torch.cat([v, v[:, -1:]], 1) for v in (x, times.expand(2, -1))]
+    longer = lagged_samples(padded[0], tau, padded[1])
+    assert torch.allclose(longer[:, :6], found)
+    assert bool(longer.isfinite().all())
 
 
-def test_a_sensor_s_delay_reads_between_its_samples():
+def test_a_sensor_s_delay_reads_between_its_samples_and_a_quantum_rounds():
     times = torch.tensor([[0.0, 0.1, 0.3, 0.3, 0.3]]).double()  # padded
     x = torch.tensor([[1.0, 2.0, 4.0, 4.0, 4.0]]).double()
-    found = delayed_samples(x, column(0.05), times)
-    assert found[0, :3].tolist() == pytest.approx([1.0, 1.5, 3.5])
+    both = delayed_samples(torch.stack([x, -x], -1), column(0.05), times)
+    for channel, sign in ((0, 1), (1, -1)):
+        found = sign * both[0, :3, channel]
+        assert found.tolist() == pytest.approx([1.0, 1.5, 3.5])
     assert torch.equal(delayed_samples(x, column(0.0), times), x)
-    two = delayed_samples(torch.stack([x, -x], -1), column(0.05), times)
-    assert two[0, :3, 1].tolist() == pytest.approx([-1.0, -1.5, -3.5])
-
-
-def test_padding_of_a_lagged_trial_is_no_number_lost():
-    times = torch.tensor([[0.0, 0.1, 0.3, 0.3, 0.3]]).double()
-    x = torch.tensor([[1.0, 2.0, 4.0, 4.0, 4.0]]).double()
-    whole = lagged_samples(x, column(0.2), times)
-    part = lagged_samples(x[:, :3], column(0.2), times[:, :3])
-    assert torch.allclose(whole[:, :3], part)
-    assert bool(whole.isfinite().all())
-
-
-def test_a_quantum_rounds():
     x = torch.tensor([[0.12, -0.37]]).double()
     assert rounded(x, column(0.1))[0].tolist() == pytest.approx([0.1, -0.4])
     assert torch.equal(rounded(x, column(0.0)), x)
 
 
-@pytest.mark.parametrize(
-    "change",
-    [
-        lambda u, phi: lagged_input(u, phi, STEP),
-        lambda u, phi: delayed_input(u, phi, STEP),
-        played,
-        lambda x, phi: lagged_samples(
-            x, phi, 0.1 * torch.arange(x.shape[1])[None].double()
-        ),
-        lambda x, phi: delayed_samples(
-            x, phi, 0.1 * torch.arange(x.shape[1])[None].double()
-        ),
-    ],
-    ids=["input lag", "input delay", "backlash", "sensor lag", "sensor delay"],
-)
-def test_none_is_flat_at_its_null(change):
+STEPS = 0.1 * torch.arange(50)[None].double()
+CHANGES = {
+    "input lag": lambda u, phi: lagged_input(u, phi, STEP),
+    "input delay": lambda u, phi: delayed_input(u, phi, STEP),
+    "backlash": played,
+    "sensor lag": lambda x, phi: lagged_samples(x, phi, STEPS),
+    "sensor delay": lambda x, phi: delayed_samples(x, phi, STEPS),
+}
+
+
+@pytest.mark.parametrize("name", CHANGES)
+def test_none_is_flat_at_its_null(name):
     """A tiny phi changes the series in proportion: the derivative at 0 exists."""
-    u = random(1, 50)
+    u, change = random(1, 50), CHANGES[name]
     assert torch.equal(change(u, column(0.0)), u)
     small, smaller = (change(u, column(p)) - u for p in (1e-5, 1e-7))
     assert float(smaller.norm()) > 1e-8
@@ -154,9 +140,9 @@ SENSOR = 0.02
 TIMES = torch.linspace(0.1, 2.0, 20).double()
 
 
-def lines(num=400, seed=0):
-    """Return motions with constant acceleration, their starts at time 0, and speeds."""
-    rng = np.random.default_rng(seed)
+def lines(num=400):
+    """Return motions of constant speed, their starts at time 0, and their speeds."""
+    rng = np.random.default_rng(0)
     place, speed = torch.from_numpy(rng.normal(size=(2, num, 1)))
     x = place + speed * TIMES + SENSOR * torch.from_numpy(rng.normal(size=(num, 20)))
     trials = Trials(torch.arange(float(num)), x, sample_times=TIMES)
@@ -191,18 +177,16 @@ def test_the_start_is_that_of_each_trial_s_own_first_sample_unless_told():
 def test_a_second_derivative_and_channels_of_their_own_errors():
     x = torch.stack([4 + 0.5 * 3 * TIMES**2, 0 * TIMES + 1], -1)[None]
     trials = Trials([1.0], x, sample_times=TIMES, start={"load": [8.0]})
-    wanted = {"force": (0, 2), "angle": 1}
-    found, nuisance = start_from_first_samples(
-        trials, wanted, within=0.6, sd=[SENSOR, 10 * SENSOR], at=0.0
-    )
-    assert {k: float(v) for k, v in found.start.items()} == pytest.approx(
-        {"load": 8.0, "force": 3.0, "angle": 1.0}
-    )
-    once = start_from_first_samples(
-        trials, wanted, within=0.6, sd=[SENSOR, SENSOR], at=0.0
-    )[1]
-    ratio = nuisance.prior.stddev / once.prior.stddev
-    assert ratio.tolist() == pytest.approx([1, 10])
+    deviations = []
+    for times in (10, 1):
+        found, nuisance = start_from_first_samples(
+            *(trials, {"force": (0, 2), "angle": 1}),
+            **{"within": 0.6, "sd": [SENSOR, times * SENSOR], "at": 0.0},
+        )
+        deviations.append(nuisance.prior.stddev)
+    start = {k: float(v) for k, v in found.start.items()}
+    assert start == pytest.approx({"load": 8.0, "force": 3.0, "angle": 1.0})
+    assert (deviations[0] / deviations[1]).tolist() == pytest.approx([1, 10])
 
 
 def test_zeros_are_taken_from_x_and_are_left_by_the_sensor_alone():
@@ -210,56 +194,21 @@ def test_zeros_are_taken_from_x_and_are_left_by_the_sensor_alone():
     zero = torch.from_numpy(rng.normal(0, 50, (300, 1, 1)))
     push = torch.cat([torch.zeros(5), torch.ones(15)]).double()[None, :, None]
     noise = SENSOR * torch.from_numpy(rng.normal(size=(300, 20, 1)))
-    other = torch.ones(300, 20, 1)
-    x = torch.cat([other, zero + push + noise], -1)
+    x = torch.cat([torch.ones(300, 20, 1), zero + push + noise], -1)
     trials = Trials(torch.arange(300.0), x, sample_times=TIMES)
     found, nuisance = zero_from_first_samples(
         trials, within=0.45, sd=SENSOR, channels=[1], width=1.0
     )
-    left = (found.x[:, 5:, 1] - 1).mean(1)
     sd = float(nuisance.prior.stddev)
     assert sd == pytest.approx(SENSOR / 5**0.5)
     expected = (sd**2 + SENSOR**2 / 15) ** 0.5
+    left = (found.x[:, 5:, 1] - 1).mean(1)
     assert float(left.std()) == pytest.approx(expected, rel=0.15)
-    assert torch.equal(found.x[..., 0], trials.x[..., 0])
-    assert float(trials.x[0, 0, 1]) == pytest.approx(float(x[0, 0, 1]))
-    context = Context(torch.zeros(300))
-    changed = nuisance.apply(found.x, torch.ones(300, 1), found.action, context)
-    assert torch.equal(changed[..., 0], found.x[..., 0])
+    assert torch.equal(trials.x, x)
+    one = torch.ones(300, 1)
+    changed = nuisance.apply(found.x, one, found.action, Context(torch.zeros(300)))
+    assert torch.equal(changed[..., 0], x[..., 0])
     assert torch.allclose(changed[..., 1], found.x[..., 1] + 1)
-
-
-def level(theta, action, *, start=None, drag=0.0):
-    """Return x' = -theta x - drag x |x| from a start, (n, k)."""
-    x = torch.zeros(len(theta)).double() if start is None else start["level"].double()
-    found, dt = [], 0.025
-    for i in range(80):
-        x = x + dt * (action[:, 0] - theta[:, 0] * x - drag * x * x.abs())
-        if i % 4 == 3:
-            found.append(x)
-    return torch.stack(found, 1).to(theta.dtype)
-
-
-def test_a_loop_finds_what_a_start_at_rest_would_hide():
-    rng = np.random.default_rng(0)
-    action = torch.from_numpy(rng.uniform(1, 4, (10, 1)))
-    start = {"level": torch.from_numpy(rng.normal(1.5, 0.5, 10))}
-    theta = torch.full((10, 1), 2.3).double()
-    x = level(theta, action, start=start, drag=0.6)
-    x = x + SENSOR * torch.from_numpy(rng.normal(size=x.shape))
-    raw = Trials(action, x, sample_times=TIMES)
-    trials, nuisance = start_from_first_samples(
-        raw, {"level": 0}, within=0.35, sd=SENSOR, at=0.0
-    )
-    drag = Effect.keyword("drag", prior=HalfNormal(1.0))
-    model = SimulatorModel(level, noise=GaussianNoise(SENSOR), sample_times=TIMES)
-    prior = Independent(Normal(torch.tensor([2.0]), torch.tensor([0.7])), 1)
-    found = Criticism(model, prior, trials, effects=[nuisance, drag], seed=0)
-    tracing = found.trace()
-    assert tracing.verdict == "drag"
-    draws = tracing.evidences["drag"].draws
-    z = (draws.mean(0) - [2.3, 0.6]) / draws.std(0)
-    assert (np.abs(z) < 3.5).all()
 
 
 def test_a_line_that_hides_gravity_is_said():
@@ -320,7 +269,7 @@ def test_what_a_parameter_depends_on_is_named(friction, verdict):
     assert report.verdict == verdict
 
 
-def test_parameters_stay_within_their_prior():
+def test_parameters_stay_within_their_prior_and_vary_by_what_varies():
     trials = trials_of(torch.full((8,), 0.5))
     effect = varying_parameters(STOPPING, FRICTION, trials)[0]
     theta = torch.tensor([[0.9, 0.1], [0.2, 0.1], [0.5, 0.1]])
@@ -328,17 +277,10 @@ def test_parameters_stay_within_their_prior():
     moved = effect.apply(theta.clone(), phi, action, None)
     expected = torch.tensor([[1.0, 0.1], [0.1, 0.1], [0.5, 0.1]])
     torch.testing.assert_close(moved, expected)
-    kept = effect.apply(theta.clone(), 0 * phi, action, None)
-    assert torch.equal(kept, theta)
-
-
-def test_labels_constants_and_an_unknown_order_vary_nothing():
-    x = torch.zeros(4, 2)
-    constant = Trials(torch.ones(4), x, order="unknown")
+    assert torch.equal(effect.apply(theta.clone(), 0 * phi, action, None), theta)
+    constant = Trials(torch.ones(4), torch.zeros(4, 2), order="unknown")
     assert varying_parameters(STOPPING, FRICTION, constant) == []
-    two = Trials(torch.tensor([[1.0, 2.0], [2.0, 2.0]]), x[:2])
-    names = [e.name for e in varying_parameters(STOPPING, FRICTION, two)]
-    assert names == [
-        *("friction by action 1", "friction by trial"),
-        *("delay by action 1", "delay by trial"),
-    ]
+    two = Trials(torch.tensor([[1.0, 2.0], [2.0, 2.0]]), torch.zeros(2, 2))
+    found = varying_parameters(STOPPING, FRICTION, two)
+    by = {e.name.partition(" by ")[2] for e in found}
+    assert (len(found), by) == (4, {"action 1", "trial"})

@@ -28,16 +28,10 @@ def line(theta, action):
     return theta[:, :1] + theta[:, 1:2] * action
 
 
-def rivals(**keywords):
+def rivals():
     model = SimulatorModel(line, noise=GaussianNoise(0.5))
-    return RivalSet(
-        model,
-        PRIOR,
-        Trials(ACTION, X),
-        [CURVE],
-        actions=DiscreteActions(torch.linspace(-2, 2, 9)),
-        **keywords,
-    )
+    actions = DiscreteActions(torch.linspace(-2, 2, 9))
+    return RivalSet(model, PRIOR, Trials(ACTION, X), [CURVE], actions=actions)
 
 
 def exact(columns, deviations, noise):
@@ -83,46 +77,6 @@ def test_scatter_sums_out_the_inflation():
     # Fourteen quantiles stand for the half-normal factor.
     error = 0.1 + 3 * evidence.standard_error
     assert evidence.log_evidence == pytest.approx(expected, abs=error)
-
-
-def test_a_curved_ridge_has_the_right_evidence():
-    # theta (1 + phi) is all that the data see: the ridge is a hyperbola.
-    gain = on_outcomes("gain", lambda x, phi, action, context: x * (1 + phi), sd=0.2)
-    sd = 1e-3
-    x = 2.0 * ACTION + sd * torch.linspace(-1, 1, 8)[:, None]
-    sets = RivalSet(
-        SimulatorModel(lambda theta, xi: theta * xi, noise=GaussianNoise(sd)),
-        normal(),
-        Trials(ACTION, x),
-        [gain],
-    )
-    evidence = sets.fit(ModelKey(("gain",))).evidence
-    phi = np.linspace(-0.95, 1.5, 4_001)
-    each = [
-        multivariate_normal(
-            np.zeros(8), (1 + p) ** 2 * np.outer(XI, XI) + sd**2 * np.eye(8)
-        ).logpdf(x[:, 0].double().numpy())
-        for p in phi
-    ]
-    density = np.exp(np.array(each) - max(each) - 0.5 * (phi / 0.2) ** 2)
-    area = np.trapezoid(density, phi) / (0.2 * np.sqrt(2 * np.pi))
-    assert evidence.engine == "importance"
-    assert evidence.log_evidence == pytest.approx(
-        max(each) + np.log(area), abs=4 * evidence.standard_error
-    )
-
-
-def test_the_posterior_is_the_exact_one():
-    evidence = rivals().fit().evidence
-    design = np.stack([XI**0, XI], 1)
-    precision = design.T @ design / 0.25 + np.diag([0.25, 1.0])
-    mean = np.linalg.solve(precision, design.T @ X[:, 0].double().numpy() / 0.25)
-    sd = np.sqrt(np.diag(np.linalg.inv(precision)))
-    assert evidence.effective_sample_size >= 60
-    # Four hundred are drawn from these with replacement, which adds to the variance.
-    error = 4 * sd * np.sqrt(1 / 100 + 1 / 400)
-    assert np.all(np.abs(evidence.draws.mean(0) - mean) < error)
-    assert np.all(np.abs(evidence.draws.std(0) - sd) < error)
 
 
 def inferred(seed=0, **given):
@@ -178,20 +132,22 @@ def bending(theta, action):
     return smooth(theta, action) + 0.04 * torch.sin(150 * theta[:, :1]) * action
 
 
-def rough(fn, *, seed=0, missing=0.0, sd=NOISE):
+def rough(fn, sd=NOISE, seed=0):
     theta = torch.tensor([[0.7, -0.4]], dtype=torch.float64)
     gen = torch.Generator().manual_seed(3)
     noise = torch.randn(8, 1, generator=gen, dtype=torch.float64)
-    x = fn(theta, PLACES.double()) + missing + sd * noise
+    x = fn(theta, PLACES.double()) + sd * noise
     model = SimulatorModel(fn, noise=GaussianNoise(sd))
     return RivalSet(model, BOX, Trials(PLACES, x), [BIAS], seed=seed)
 
 
-def test_a_smooth_simulator_has_none():
-    found = rough(smooth)
+@pytest.mark.parametrize(("fn", "sd"), [(smooth, NOISE), (bending, 0.001)])
+def test_a_smooth_simulator_has_no_jumps(fn, sd):
+    found = rough(fn, sd)
     assert found.is_smooth
+    assert found.step < 1e-2
     assert not found.roughness.any()
-    assert found.noise.cells[0].sd == pytest.approx(NOISE)
+    assert found.noise.cells[0].sd == pytest.approx(sd)
 
 
 @pytest.mark.parametrize("seed", [0, 1])
@@ -199,25 +155,12 @@ def test_jumps_have_their_size_and_count_as_noise(seed):
     found = rough(jumping, seed=seed)
     assert not found.is_smooth
     # The median of |sin| over that of |normal|, by its error from 64 draws.
-    assert np.median(found.roughness) == pytest.approx(
-        JUMP * np.sqrt(0.5) / 0.6745, rel=0.2
-    )
+    size = JUMP * np.sqrt(0.5) / 0.6745
+    assert np.median(found.roughness) == pytest.approx(size, rel=0.2)
     assert found.noise.cells[0].sd == pytest.approx(np.hypot(NOISE, found.roughness))
-
-
-@pytest.mark.parametrize("seed", range(2))
-def test_steps_are_jumps_though_the_slopes_between_them_agree(seed):
-    found = rough(stepping, seed=seed)
-    assert not found.is_smooth
-    assert float(np.median(found.roughness)) > NOISE
-
-
-@pytest.mark.parametrize("seed", range(2))
-def test_a_response_that_bends_does_not_jump(seed):
-    found = rough(bending, seed=seed, sd=0.001)
-    assert found.is_smooth
-    assert found.step < 1e-2
-    assert not found.roughness.any()
+    steps = rough(stepping, seed=seed)  # whose slopes agree between them
+    assert not steps.is_smooth
+    assert float(np.median(steps.roughness)) > NOISE
 
 
 def test_repeated_actions_are_simulated_once_and_predict_the_same():
@@ -228,26 +171,19 @@ def test_repeated_actions_are_simulated_once_and_predict_the_same():
         return jumping(theta, action)
 
     action = PLACES[[0, 3, 3, 5, 0, 7]]
-    trials = Trials(action, torch.zeros(6, 1))
     model = SimulatorModel(counting, noise=GaussianNoise(NOISE))
-    simulator = TrialSimulator(AugmentedSimulator(model, [BIAS, DRIFT]), trials)
+    own = AugmentedSimulator(model, [BIAS, DRIFT])
+    simulator = TrialSimulator(own, Trials(action, torch.zeros(6, 1)))
     theta = BOX.sample((5,)).double()
-    phi = {"bias": torch.linspace(-1, 1, 5, dtype=torch.float64)[:, None]}
+    bias = torch.linspace(-1, 1, 5, dtype=torch.float64)[:, None]
     simulator.predict(theta[:1], {})  # effects are held to their nulls before
     seen.clear()
-    mean, _, _ = simulator.predict(theta, phi)
-    assert seen == [5 * 4]
-    expected = (
-        jumping(theta.repeat_interleave(6, 0), action.double().repeat(5, 1)).reshape(
-            5, 6
-        )
-        + phi["bias"]
-    )
-    assert np.array_equal(mean, expected.numpy())
+    mean, _, _ = simulator.predict(theta, {"bias": bias})
+    every = jumping(theta.repeat_interleave(6, 0), action.double().repeat(5, 1))
+    assert np.array_equal(mean, (every.reshape(5, 6) + bias).numpy())
     # What depends on the trial's place is no repetition.
-    seen.clear()
-    simulator.predict(theta, {"drift": phi["bias"] + 3.14159})
-    assert seen == [5 * 6]
+    simulator.predict(theta, {"drift": bias + 3.14159})
+    assert seen == [5 * 4, 5 * 6]
 
 
 def test_a_random_simulator_is_not_merged():

@@ -8,8 +8,7 @@ import pytest
 from scipy.optimize import lsq_linear
 
 from sbi_active.criticism.linear.left_out import bounded, leave_out
-from sbi_active.criticism.linear.model import LinearModel
-from sbi_active.criticism.results import ModelKey
+from tests.criticism.linear.linear_models import linear_model
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -37,22 +36,7 @@ def line():
     """A line through trials of two numbers, the last of which is far away."""
     rng = np.random.default_rng(1)
     x = np.append(rng.normal(size=14), [30.0, 30.0])
-    everywhere = np.full(2, np.inf)
-    model = LinearModel(
-        key=ModelKey(),
-        u=np.zeros(2),
-        residual=2 * rng.normal(size=16),
-        jacobian=np.stack([np.ones(16), x], 1),
-        center=np.zeros(2),
-        sd=np.full(2, 1e3),
-        scaled=np.zeros(2, bool),
-        low=-everywhere,
-        high=everywhere,
-        trial_of=np.full(2, -1),
-        num=16,
-        scale=np.ones(16),
-        offset=np.zeros(16),
-    )
+    model = linear_model(2 * rng.normal(size=16), np.stack([np.ones(16), x], 1))
     fold = np.repeat(np.arange(8), 2)
     errors = SimpleNamespace(fold=fold, num_folds=8, is_scored=np.ones(16, bool))
     return model, errors
@@ -91,17 +75,8 @@ def test_weights_are_those_of_least_squares(line):
 def test_a_coordinate_at_its_bound_is_no_excuse_for_an_error(line):
     """An effect that its bound keeps away leaves errors as they are without it."""
     model, errors = line
-    x = model.jacobian[:, 1]
-    wide = replace(
-        model,
-        jacobian=np.concatenate([model.jacobian, -(x**2)[:, None]], 1),
-        u=np.zeros(3),
-        center=np.zeros(3),
-        sd=np.full(3, 1e3),
-        scaled=np.zeros(3, bool),
-        low=np.append(model.low, 0.0),
-        high=np.append(model.high, 0.0 + 1e-12),
-        trial_of=np.full(3, -1),
-    )
+    columns = np.column_stack([model.jacobian, -(model.jacobian[:, 1] ** 2)])
+    bounds = {"low": np.append(model.low, 0.0), "high": np.append(model.high, 1e-12)}
+    wide = linear_model(model.residual, columns, **bounds)
     found = leave_out(wide, errors).standard
     assert found == pytest.approx(leave_out(model, errors).standard, rel=1e-6)

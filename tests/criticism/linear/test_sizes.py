@@ -3,12 +3,12 @@
 import numpy as np
 import torch
 from sbi.utils import BoxUniform
-from torch.distributions import HalfNormal, Normal
 
 from sbi_active import GaussianNoise, SimulatorModel
-from sbi_active.criticism import Criticism, Effect, Trials
+from sbi_active.criticism import Criticism, Trials
 from sbi_active.criticism.steps.equivalence import MANY
 from sbi_active.criticism.steps.tracing import log_priors
+from tests.effects import louder, on_outcomes
 
 TIMES = torch.linspace(0, 2, 30)
 PRIOR = BoxUniform(torch.tensor([-2.0]), torch.tensor([2.0]))
@@ -20,23 +20,8 @@ def series(theta, action):
 
 def pattern(k):
     wave = (torch.cos, torch.sin)[k % 2](3 * (1 + k // 2) * TIMES)
-    return Effect(
-        f"wave {k}",
-        hook="observation",
-        prior=Normal(0.0, 0.3),
-        null=0.0,
-        apply=lambda x, phi, action, context: x + phi * wave,
-        family="wave",
-    )
-
-
-NOISE = Effect(
-    "noise",
-    hook="noise",
-    prior=HalfNormal(1.0),
-    null=0.0,
-    apply=lambda sd, phi, action, context: sd * (1 + phi[:, :1]),
-)
+    apply = lambda x, phi, action, context: x + phi * wave  # noqa: E731
+    return on_outcomes(f"wave {k}", apply, 0.3, family="wave")
 
 
 def loop_of(number, strength, *more):
@@ -49,27 +34,22 @@ def loop_of(number, strength, *more):
     return Criticism(model, PRIOR, Trials(action, x), effects=effects, seed=0)
 
 
-def verdict(number, strength):
-    return loop_of(number, strength).trace()
-
-
 def test_clean_trials_of_many_effects_say_none():
-    assert verdict(MANY + 1, 0.0).verdict == "none"
+    assert loop_of(MANY + 1, 0.0).trace().verdict == "none"
 
 
 def test_one_effect_more_does_not_change_the_verdict():
-    few, many = (verdict(MANY + k, 0.2) for k in (0, 1))
+    few, many = (loop_of(MANY + k, 0.2).trace() for k in (0, 1))
     assert few.verdict == many.verdict == "wave 2"
     assert abs(few.inclusion["wave 2"] - many.inclusion["wave 2"]) < 0.1
 
 
 def test_what_was_set_aside_counts_in_the_prior_and_is_said():
-    loop = loop_of(MANY + 6, 0.2, NOISE)
-    report = " ".join(str(loop.report(evaluate=False, plan=False)).split())
-    fitted, library = len(loop.rivals.effects), loop.effects
-    assert fitted < len(library)
-    assert f"of {len(library)} effects {fitted} were fitted" in report
-    assert log_priors(loop.rivals.library) == log_priors(library)
+    loop = loop_of(MANY + 6, 0.2, louder())
+    report = loop.report(evaluate=False, plan=False)
+    assert len(loop.rivals.effects) < len(loop.effects)
+    assert "SA527" in [w.code for w in report.warnings]
+    assert log_priors(loop.rivals.library) == log_priors(loop.effects)
     gone = next(iter(loop.screening.behind))
     assert loop.add([gone])[1].event_shape[0] == 2  # can be added all the same
-    assert "noise" in loop.screening.kept  # of which no column tells
+    assert "louder" in loop.screening.kept  # of which no column tells

@@ -7,7 +7,7 @@ from torch.distributions import HalfNormal, Independent, Normal
 from sbi_active import GaussianNoise, SimulatorModel
 from sbi_active.criticism import Effect, Trials
 
-NUM_TRIALS, NUM_SAMPLES, STEPS = 8, 20, 1
+NUM_TRIALS, NUM_SAMPLES = 8, 20
 TIMES = torch.linspace(0.2, 4.0, NUM_SAMPLES, dtype=torch.float64)
 SENSOR = 0.01
 PRIOR = Independent(Normal(torch.tensor([2.0, 0.3]), torch.tensor([0.5, 0.1])), 1)
@@ -19,28 +19,18 @@ EFFECTS = [
 ]
 
 
-def oscillate(
-    theta: Tensor,
-    action: Tensor,
-    *,
-    cubic: Tensor | float = 0.0,
-    friction: Tensor | float = 0.0,
-    lag: Tensor | float = 0.0,
-    bias: Tensor | float = 0.0,
-    hidden: Tensor | float = 0.0,
-) -> Tensor:
+def oscillate(theta, action, *, cubic=0.0, friction=0.0, lag=0.0, bias=0.0, hidden=0.0):
     """Return positions at the sample times of x'' = -k x - c x' + u sin 2t, (n, k)."""
     k, c = theta.T.double()
     u = action[:, 0].double()
     x, v = torch.zeros_like(k), torch.zeros_like(k)
-    dt, found = 0.2 / STEPS, []
-    for i in range(NUM_SAMPLES * STEPS):
+    dt, found = 0.2, []
+    for i in range(NUM_SAMPLES):
         drive = u * torch.sin(torch.tensor(2 * dt * i, dtype=torch.float64))
         a = drive - k * x - c * v - cubic * x**3 - friction * torch.tanh(v / 0.05)
         v = v + dt * (a + hidden * torch.cos(3 * x) * x)
         x = x + dt * v
-        if (i + 1) % STEPS == 0:
-            found.append(x - lag * v + bias)
+        found.append(x - lag * v + bias)
     return torch.stack(found, 1).to(theta.dtype)
 
 

@@ -8,7 +8,8 @@ from torch.distributions import HalfNormal, Normal
 from sbi_active import GaussianNoise, SimulatorModel
 from sbi_active.criticism import Criticism, Effect, Trials
 from sbi_active.criticism.results import ModelKey
-from sbi_active.criticism.steps.predictive import predict
+from sbi_active.criticism.rivals.trial_simulator import TrialSimulator
+from sbi_active.criticism.steps.predictive import conditioned, predict
 
 SENSOR, NUM, NUM_HELD, SAMPLES = 0.01, 12, 4, 30
 TIMES = torch.linspace(0.1, 3.0, SAMPLES, dtype=torch.float64)
@@ -84,28 +85,19 @@ def test_a_held_out_trial_tells_of_its_start_by_its_first_samples(found):
 
 def test_start_states_are_those_of_least_squares(found):
     """Drawn given the first samples, against a search over the start alone."""
-    from sbi_active.criticism.rivals.trial_simulator import TrialSimulator
-    from sbi_active.criticism.steps.predictive import conditioned
-
     criticism, own, start = found
     criticism.trace()
     rivals = criticism.rivals
     fit = rivals.fit(ModelKey(("drag",)))
-    u = fit.sample.u[:40]
     simulator = TrialSimulator(rivals.simulator.model, own.held_out)
     rng = np.random.default_rng(0)
-    theta, phi = conditioned(rivals, fit, u, simulator, rng)
-    drawn = phi["start"][..., 0].numpy()
+    theta, phi = conditioned(rivals, fit, fit.sample.u[:40], simulator, rng)
     grid = torch.linspace(-2, 2, 2001, dtype=torch.float64)
-    middle, drag = float(theta.mean()), float(phi["drag"].mean())
-    for t in range(4):
+    middle = torch.full((len(grid), 1), float(theta.mean()), dtype=torch.float64)
+    for t, drawn in enumerate(phi["start"][..., 0].T.numpy()):
         action = own.held_out.action[t].expand(len(grid), -1)
-        x = level(
-            torch.full((len(grid), 1), middle).double(), action, start=grid, drag=drag
-        )
+        x = level(middle, action, start=grid, drag=float(phi["drag"].mean()))
         square = ((x - own.held_out.x[t])[:, :6] ** 2).sum(1)
         best = float(grid[int(square.argmin())])
-        assert drawn[:, t].mean() == pytest.approx(
-            best, abs=4 * drawn[:, t].std() + 0.01
-        )
-        assert drawn[:, t].std() < 0.1
+        assert drawn.mean() == pytest.approx(best, abs=4 * drawn.std() + 0.01)
+        assert drawn.std() < 0.1

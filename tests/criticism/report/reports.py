@@ -126,19 +126,14 @@ def evaluation(num: int = 8) -> Evaluation:
         "log predictive density": -20 - 5 * rng.random(num),
         "coverage": np.round(rng.random(num) * 6) / 6,
     }
-    after = {
-        "rmse": before["rmse"] / 5,
-        "energy score": before["energy score"] / 4,
-        "log predictive density": before["log predictive density"] + 35,
-        "coverage": np.full(num, 5 / 6),
-    }
-    enough = num >= 8
-    rows = []
-    for name in before:
-        b, a = before[name].mean(), after[name].mean()
-        ratio = a - b if name in ("log predictive density", "coverage") else a / b
-        ends = (0.9 * ratio, 1.1 * ratio) if enough else (np.nan, np.nan)
-        rows.append((name, b, a, ratio, *ends))
+    changed = {"rmse": (0.2, 0.0), "energy score": (0.25, 0.0), "coverage": (0.0, 0.8)}
+    after, rows = {}, []
+    for name, b in before.items():
+        times, more = changed.get(name, (1.0, 35.0))
+        after[name] = times * b + more
+        one, other = b.mean(), after[name].mean()
+        ratio = other - one if more else times
+        rows.append((name, one, other, ratio, 0.9 * ratio, 1.1 * ratio))
     columns = pd.Index(["metric", "before", "after", "ratio", "low", "high"])
     return Evaluation(
         scheme="held out",

@@ -35,37 +35,48 @@ def decided(form, *, model=MODEL, prior=PRIOR, fitted=9, held_out=4, seed=0):
     return report.gate
 
 
-def test_a_right_simulator_ships():
-    gate = decided(lambda xi, fits: 0.7 * xi)
-    assert (gate.decision, gate.exit_code) == ("SHIP", 0)
-    assert gate.details["before"] < 3 * NOISE
+#: Mean of x, options, decision, and what holds of its details.
+CASES = {
+    "right": (
+        lambda xi, fits: 0.7 * xi,
+        *({}, "SHIP", lambda own: own["before"] < 3 * NOISE),
+    ),
+    "an effect is missing": (
+        lambda xi, fits: 0.7 * xi + 0.8,
+        *({}, "WRONG_MODEL", lambda own: own["after"] < own["before"] / 2),
+    ),
+    "nothing is named": (
+        lambda xi, fits: 0.7 * xi + torch.sin(4 * xi),
+        *({}, "WRONG_MODEL", lambda own: own["worst"]["deviations"] > 1),
+    ),
+    "held-out trials are missed": (
+        lambda xi, fits: 0.7 * xi + torch.where(fits, 0.0, 2.0),
+        *({}, "WRONG_MODEL", lambda own: len(own["trials"]) >= 3),
+    ),
+    "the error is no smaller": (
+        lambda xi, fits: 0.7 * xi + torch.where(fits, 0.8, 0.0),
+        *({}, "NO_IMPROVEMENT", lambda own: own["after"] > own["before"]),
+    ),
+    "a positive parameter": (
+        lambda xi, fits: 0.1 * xi,
+        {"prior": BoxUniform(torch.tensor([0.5]), torch.tensor([3.0]))},
+        *("OUT_OF_PRIOR", lambda own: 0 < own["box"]["slope"]["lower"] < 0.1),
+    ),
+    "few trials": (
+        lambda xi, fits: 0.7 * xi,
+        *({"fitted": 3, "held_out": 1}, "NOT_ENOUGH_DATA", lambda own: True),
+    ),
+}
 
 
-def test_an_effect_that_is_missing_is_named():
-    gate = decided(lambda xi, fits: 0.7 * xi + 0.8)
-    assert gate.decision == "WRONG_MODEL"
-    assert gate.details["effects"] == ["bias"]
-    assert gate.details["after"] < gate.details["before"] / 2
-
-
-def test_where_a_simulator_misses_is_said_if_nothing_is_named():
-    gate = decided(lambda xi, fits: 0.7 * xi + torch.sin(4 * xi))
-    assert gate.decision == "WRONG_MODEL"
-    assert not gate.details["effects"]
-    assert gate.details["worst"]["deviations"] > 1
-
-
-def test_held_out_trials_that_are_missed_close_the_gate():
-    gate = decided(lambda xi, fits: 0.7 * xi + torch.where(fits, 0.0, 2.0))
-    assert gate.decision == "WRONG_MODEL"
-    assert len(gate.details["trials"]) >= 3
-
-
-def test_an_effect_that_does_not_lower_the_error_is_no_improvement():
-    gate = decided(lambda xi, fits: 0.7 * xi + torch.where(fits, 0.8, 0.0))
-    assert gate.decision == "NO_IMPROVEMENT"
-    assert "bias" in gate.reason
-    assert gate.details["after"] > gate.details["before"]
+@pytest.mark.parametrize("case", CASES)
+def test_a_decision_has_its_details(case):
+    form, options, decision, holds = CASES[case]
+    gate = decided(form, **options)
+    assert gate.decision == decision
+    assert holds(gate.details)
+    is_named = decision == "WRONG_MODEL" and gate.details.get("effects") == ["bias"]
+    assert is_named == (case == "an effect is missing")
 
 
 def test_a_truth_outside_the_prior_says_which_bound_to_move():
@@ -74,13 +85,6 @@ def test_a_truth_outside_the_prior_says_which_bound_to_move():
     (bound,) = gate.details["bounds"]
     assert (bound["name"], bound["side"], bound["bound"]) == ("slope", "upper", 3.0)
     assert 4.0 < gate.details["box"]["slope"]["upper"] < 6.0
-
-
-def test_a_wider_box_keeps_the_sign_of_what_is_positive():
-    prior = BoxUniform(torch.tensor([0.5]), torch.tensor([3.0]))
-    gate = decided(lambda xi, fits: 0.1 * xi, prior=prior)
-    assert gate.decision == "OUT_OF_PRIOR"
-    assert 0 < gate.details["box"]["slope"]["lower"] < 0.1
 
 
 def test_parameters_that_are_known_together_alone_are_not_identifiable():
@@ -120,12 +124,6 @@ def test_trajectories_that_tell_a_product_alone_are_not_identifiable():
     factor = report.tracing.evidences["none"].draws[:, 1]
     # Its density falls with 1 / factor from .5 to 2.
     assert factor.std() == pytest.approx(0.427, rel=0.12)
-
-
-def test_few_trials_are_not_enough():
-    gate = decided(lambda xi, fits: 0.7 * xi, fitted=3, held_out=1)
-    assert gate.decision == "NOT_ENOUGH_DATA"
-    assert "measure more" in gate.reason
 
 
 def test_three_trials_of_which_one_contradicts():

@@ -21,17 +21,13 @@ from sbi_active.criticism.report.figures import (
     plot_residuals,
 )
 from sbi_active.criticism.report.sections import head
-from sbi_active.criticism.report.words import with_error
 from tests.criticism.report.reports import DRAG, flat, report, residuals, tracing
 from tests.display.parsed import Parsed
 
 NONE = {"tracing": tracing("none"), "residuals_after": None}
 
 
-TESTS = (
-    SevereTest(action=np.array([3.0]), is_permitted=True, difference=1.234),
-    SevereTest(action=np.array([4.5]), is_permitted=False, difference=56.7),
-)
+TESTS = (SevereTest(action=np.array([3.0]), is_permitted=True, difference=1.234),)
 
 
 def test_a_dictionary_has_no_probabilities_where_they_contradict_the_verdict():
@@ -42,56 +38,33 @@ def test_a_dictionary_has_no_probabilities_where_they_contradict_the_verdict():
     assert withdrawn["probabilities"] is withdrawn["credible_set"] is None
 
 
-def test_only_a_bare_model_that_holds_is_a_stop():
-    plan = replace(report().next_action, action=None)
-    left, alone = (replace(plan, separates=(name,)) for name in ("none", "drag"))
-    text = flat(report(next_action=plan, **NONE))
-    assert "Stop: no permitted action tells more" in text
-    text = flat(report(next_action=left, **NONE))
-    assert "Stop: of the declared models only none is left." in text
-    text = flat(report(next_action=alone))
-    assert "Of the declared models only drag is left." in text
-
-
-def test_a_verdict_that_is_not_the_likeliest_model_says_why():
-    shares = {"scatter": 0.11, "tilt": 0.46, "drag": 0.43}
-    made = tracing("scatter", probabilities=shares, credible_set=("tilt", "drag"))
-    assert str(report(tracing=made)).splitlines()[0] == (
-        "Verdict: scatter (P = 0.11), though tilt is likelier (P = 0.46), which is not "
-        "shown to predict other trials better"
-    )
-    assert "likelier" not in str(report())
-
-
-def test_a_deviation_needs_draws_behind_it():
-    made = tracing()
-    estimates = [replace(e, effective_sample_size=49.0) for e in made.estimates]
-    few = replace(
-        made.evidences["none"], effective_sample_size=2.2, draws=np.full((400, 2), 0.1)
-    )
-    evidences = made.evidences | {"none": few}
-    text = flat(
-        report(tracing=replace(made, estimates=(*estimates,), evidences=evidences))
-    )
-    assert "about 0.12 1/m" in text
-    assert "mu_1 about 0.1 " in text
-    assert '"about": below 50 effective samples' in text
-    assert "(more than 1000 of its standard deviations)" in text
-    assert "about" not in flat(report()).split("Parameters")[1].split("Next")[0]
+LIKELIER = {
+    "probabilities": {"scatter": 0.11, "tilt": 0.46, "drag": 0.43},
+    "credible_set": ("tilt", "drag"),
+}
+ONE_LEFT = replace(report().next_action, action=None)
+FEW_DRAWS = tuple(replace(e, effective_sample_size=49.0) for e in tracing().estimates)
 
 
 @pytest.mark.parametrize(
-    ("mean", "sd", "text"),
+    ("changes", "words"),
     [
-        (0.35992, 0.00071, "0.35992 +- 0.00071"),
-        (-1234.56, 56.7, "-1235 +- 57"),
-        (0.3, 0.0996, "0.30 +- 0.10"),
-        (2.0, 0.0, "2 +- 0"),
-        (np.nan, np.nan, ""),
+        ({"next_action": ONE_LEFT, **NONE}, "Stop: no permitted action"),
+        (
+            {"next_action": replace(ONE_LEFT, separates=("none",)), **NONE},
+            "Stop: of the",
+        ),
+        ({"next_action": replace(ONE_LEFT, separates=("drag",))}, "only drag is left"),
+        (
+            {"tracing": tracing("scatter", **LIKELIER)},
+            "though tilt is likelier (P = 0.46)",
+        ),
+        ({"tracing": tracing(estimates=FEW_DRAWS)}, "about 0.12 1/m"),
     ],
 )
-def test_numbers_have_the_digits_that_their_deviation_leaves(mean, sd, text):
-    assert with_error(mean, sd) == text
+def test_what_is_said_of_a_case_and_of_no_other(changes, words):
+    assert words in flat(report(**changes))
+    assert words not in flat(report())
 
 
 def test_a_report_goes_through_json_with_all_sections():
@@ -157,31 +130,23 @@ def test_save_writes_the_page_and_every_figure(tmp_path):
 def points(ax):
     """Return what is drawn as points, shape (n, 2), a row each, in one order."""
     drawn = [line.get_xydata() for line in ax.lines if line.get_marker() == "."]
-    return rows_in_order(np.concatenate(drawn))
+    return sorted(map(tuple, np.concatenate(drawn)))
 
 
-def rows_in_order(rows):
-    return rows[np.lexsort(rows.T)]
-
-
-@pytest.mark.parametrize("shape", [(1,), (6,)])
-def test_every_residual_is_drawn_at_its_action_its_trial_and_its_channel(shape):
-    before, after = residuals(shape, size=4.0), residuals(shape)
-    figure = plot_residuals(before, after, action_labels=["speed"], added="a gain")
-    columns = 2 if shape == (1,) else 3
+@pytest.mark.parametrize("num", [1, 6])
+def test_every_residual_is_drawn_at_its_action_its_trial_and_its_channel(num):
+    both = residuals((num,), size=4.0), residuals((num,))
+    figure = plot_residuals(*both, action_labels=["speed"], added="a gain")
+    columns = 2 if num == 1 else 3
     assert len(figure.axes) == 2 * columns
-    for row, (made, color, title) in enumerate(
-        [(before, BEFORE, "bare model"), (after, AFTER, "with a gain")]
-    ):
+    for row, (made, color) in enumerate(zip(both, (BEFORE, AFTER), strict=True)):
         panels = figure.axes[row * columns : (row + 1) * columns]
-        num = shape[0]
         channel = np.tile(np.arange(num), len(made.index))
         places = [np.repeat(made.action[:, 0], num), np.repeat(made.index, num)]
         for ax, place in zip(panels, [*places, channel], strict=False):
-            expected = np.column_stack([place, made.refitted.ravel()])
-            np.testing.assert_allclose(points(ax), rows_in_order(expected))
+            expected = sorted(zip(place, made.refitted.ravel(), strict=True))
+            np.testing.assert_allclose(points(ax), expected)
             assert {line.get_color() for line in ax.lines[:num]} == {color}
-        assert panels[0].get_ylabel().startswith(title)
 
 
 def test_bars_are_as_long_as_probabilities_the_most_probable_on_top():
@@ -192,13 +157,5 @@ def test_bars_are_as_long_as_probabilities_the_most_probable_on_top():
     names = [label.get_text() for label in ax.get_yticklabels()]
     assert names == ["none", "drag + tilt", "scatter", "tilt", "drag"]  # upwards
     assert [bar.get_width() for bar in ax.patches] == [shares[n] for n in names]
-    filled = {n for n, b in zip(names, ax.patches, strict=True) if is_filled(b)}
-    assert filled == {"drag", "tilt"}
-    texts = [text.get_text() for text in ax.texts]
-    assert texts == ["< 0.01", "0.01", "0.05", "0.33", "0.60"]
-    (ax,) = plot_probabilities(found, at_most=2).axes
-    assert [label.get_text() for label in ax.get_yticklabels()] == ["tilt", "drag"]
-
-
-def is_filled(bar):
-    return to_hex(bar.get_facecolor()) == AFTER
+    filled = [to_hex(bar.get_facecolor()) == AFTER for bar in ax.patches]
+    assert filled == [name in ("drag", "tilt") for name in names]

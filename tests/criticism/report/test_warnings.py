@@ -7,7 +7,7 @@ import pytest
 import torch
 from sbi.utils import BoxUniform
 
-from sbi_active import DiscreteActions, GaussianNoise, SimulatorModel
+from sbi_active import GaussianNoise, SimulatorModel
 from sbi_active.criticism import Trials, close_loop, joint_prior
 from sbi_active.criticism.contradictions import (
     BoundParameter,
@@ -17,22 +17,18 @@ from sbi_active.criticism.contradictions import (
 )
 from tests.criticism.report.reports import (
     DRAG,
+    SHUFFLED,
     evaluation,
     report,
     residuals,
     tracing,
     trials,
 )
-from tests.effects import autocorrelated, effect, normal, on_outcomes
+from tests.effects import BIAS, autocorrelated, on_outcomes
 
 SURE = report().detection
 HELD = evaluation()
 RIGHT = tracing()
-
-
-def right(**changes):
-    """Return a report that deserves none of them, but for changes."""
-    return report(**changes)
 
 
 def noted(**changes):
@@ -91,10 +87,9 @@ def errors(after):
 
 def growing(rate, num=9):
     made = residuals(num=num)
-    size = np.exp(rate * np.arange(num))[:, None]
-    grown = replace(made, refitted=made.refitted * size, x=2 + made.refitted * size)
-    actions = [2.0, -1.0, 3.0, 1.0, -2.0, -3.0, 1.5, -1.5, 2.5]
-    own = trials(actions)
+    z = made.refitted * np.exp(rate * np.arange(num))[:, None]
+    grown = replace(made, refitted=z, x=2 + z)
+    own = trials(SHUFFLED[:num])
     return {"residuals": grown, "residuals_after": grown, "trials": own}
 
 
@@ -102,10 +97,7 @@ def forced(*, taken):
     def with_force(theta, action, *, force=None):
         return theta[:, :1] * torch.ones(1, 6)
 
-    def without(theta, action):
-        return theta[:, :1] * torch.ones(1, 6)
-
-    fn = with_force if taken else without
+    fn = with_force if taken else lambda theta, action: with_force(theta, action)
     return told("unexplained") | {"simulator": SimulatorModel(fn)}
 
 
@@ -173,46 +165,26 @@ def test_each_caution_has_its_case(kind):
         return [w for w in made.warnings if w.code == code and words in w]
 
     deserved, near = CASES[kind]
-    made = right(**deserved)
+    made = report(**deserved)
     (sentence,) = said(made)
     text = sentence.removesuffix(f" ({code})")
     assert f"- {code} {text}" in " ".join(str(made).split())
-    assert not said(right(**near))
-
-
-def test_a_report_of_a_right_model_has_none():
-    assert right().warnings == ()
-    assert "Warnings" not in str(right())
-
-
-def curve(theta, action, quadratic=0.0):
-    xi = action[:, 0]
-    return (theta[:, 0] * xi + quadratic * xi**2)[:, None]
-
-
-def measured(missing, **options):
-    """Return the report of a curve that misses something, at shuffled actions."""
-    order = torch.tensor([5, 12, 0, 9, 14, 2, 16, 7, 11, 3, 8, 15])
-    action = DiscreteActions(torch.linspace(-2, 2, 17)).values[order].double()
-    action = torch.cat([action, action[:1].expand(4, 1)])
-    x = action + missing(action)
-    x = x + 0.1 * torch.randn(x.shape, generator=torch.manual_seed(1)).double()
-    known = {"order": options.pop("order", "known")}
-    model = SimulatorModel(curve, noise=options.pop("noise", GaussianNoise(0.1)))
-    trials = Trials(action, x, **known)
-    prior = BoxUniform(-3 * torch.ones(1), 3 * torch.ones(1))
-    return close_loop(model, prior, trials, evaluate=False, plan=False, **options)
+    assert not said(report(**near))
+    assert report().warnings == ()  # of a right model
 
 
 def test_trials_of_unknown_order_drift_nowhere():
-    bias = effect(prior=normal(0.5))
-    drift = on_outcomes(
-        "drift",
-        lambda x, phi, action, context: x + phi * context.index[:, None],
-        0.1,
-        needs_order=True,
-    )
-    made = measured(lambda xi: 0.8, effects=[bias, drift], order="unknown")
+    def drifting(x, phi, action, context):
+        return x + phi * context.index[:, None]
+
+    drift = on_outcomes("drift", drifting, 0.1, needs_order=True)
+    action = torch.linspace(-2, 2, 16)[:, None].double()
+    x = action + 0.8
+    x = x + 0.1 * torch.randn(x.shape, generator=torch.manual_seed(1)).double()
+    model = SimulatorModel(lambda theta, xi: theta * xi, noise=GaussianNoise(0.1))
+    prior = BoxUniform(-3 * torch.ones(1), 3 * torch.ones(1))
+    own = Trials(action, x, order="unknown")
+    made = close_loop(model, prior, own, effects=[BIAS, drift], evaluate=False)
     assert "SA526" in [w.code for w in made.warnings]
     assert "drift" not in made.probabilities
     assert made.verdict == "bias"

@@ -6,24 +6,12 @@ import torch
 from sbi.utils import BoxUniform
 from torch.distributions import Independent, LogNormal, Normal
 
-from sbi_active.criticism import Effect
 from sbi_active.criticism.rivals.coordinates import WIDE, SearchCoordinates
-
-
-def effect(name, prior, scope="campaign"):
-    return Effect(
-        name,
-        hook="observation",
-        prior=prior,
-        null=0.0,
-        scope=scope,
-        apply=lambda x, phi, action, context: x,
-    )
-
+from tests.effects import effect, half, normal
 
 BOX = BoxUniform(torch.tensor([1.0]), torch.tensor([3.0]))
-WIDE_ONE = effect("wide", LogNormal(torch.zeros(1), 2 * torch.ones(1)))
-START = effect("start", Normal(torch.zeros(2), torch.ones(2)), scope="trial")
+WIDE_ONE = effect("wide", prior=LogNormal(torch.zeros(1), 2 * torch.ones(1)))
+START = effect("start", prior=Normal(torch.zeros(2), torch.ones(2)), scope="trial")
 
 
 def coordinates(num_trials=3):
@@ -42,14 +30,12 @@ def test_the_density_is_the_prior_s_times_the_jacobian():
 
 
 def test_only_a_positive_number_of_wide_prior_is_searched_in_logs():
-    c = coordinates()
-    assert c.is_log.tolist() == [False, True, *[False] * 6]
+    assert coordinates().is_log.tolist() == [False, True, *[False] * 6]
     # 5 % to 95 % of a log-normal of deviation s span exp(3.29 s).
-    sd = np.log(WIDE) / 3.29
     for factor, is_log in ((0.9, False), (1.1, True)):
-        prior = LogNormal(torch.zeros(1), torch.tensor([factor * sd]))
-        one = SearchCoordinates(BOX, [effect("one", prior)], (), 1)
-        assert one.is_log[1] == is_log
+        sd = torch.tensor([factor * np.log(WIDE) / 3.29])
+        one = effect("one", prior=LogNormal(torch.zeros(1), sd))
+        assert SearchCoordinates(BOX, [one], (), 1).is_log[1] == is_log
 
 
 def test_bounds_stay_bounds_and_count_as_within():
@@ -58,8 +44,7 @@ def test_bounds_stay_bounds_and_count_as_within():
     u = np.zeros((4, c.dim))
     u[:, 0] = [c.low[0], c.high[0], c.low[0] - 1e-6, c.high[0] + 1e-6]
     assert np.isfinite(c.log_prob(u)).tolist()[2:] == [False, False]
-    ends = c.to_z(u)[:2, 0]
-    assert ends == pytest.approx([1.0, 3.0])
+    assert c.to_z(u)[:2, 0] == pytest.approx([1.0, 3.0])
     assert c.from_z(c.to_z(u)) == pytest.approx(u)
 
 
@@ -75,3 +60,26 @@ def test_a_coordinate_is_at_the_bound_where_its_draws_pile_up():
         assert c.sides(c.from_z(whole)[:, :1]).tolist() == [side]
         # Beside it are numbers without a bound, or with one.
         assert c.sides(c.from_z(whole))[1:].tolist() == [0] * (c.dim - 1)
+
+
+# Coordinates carried from one rival to another mean the same there
+
+
+FRICTION = effect("friction", prior=half(45.0))
+OTHERS = [effect(f"other {k}") for k in range(3)]
+
+
+def test_an_effect_and_a_nuisance_have_the_same_units_in_every_rival():
+    prior = BoxUniform(torch.zeros(2), torch.tensor([1.0, 3.0]))
+    alone = SearchCoordinates(prior, [FRICTION], [], 5)
+    null = alone.from_z(np.array([[0.5, 1.0, 0.0]]))[0]
+    for place, effects in ((5, [*OTHERS, FRICTION]), (2, [FRICTION, *OTHERS])):
+        other = SearchCoordinates(prior, effects, [], 5)
+        u = other.from_z(np.zeros((1, 6)))
+        assert u[0, place] == other.low[place] == alone.low[2] == null[2]
+        u[0, :2] = null[:2]
+        np.testing.assert_allclose(other.to_z(u)[0, :2], [0.5, 1.0])
+    offset = effect("offset", prior=normal(3.0))
+    alone, beside = (SearchCoordinates(prior, e, [offset], 4) for e in ([], [FRICTION]))
+    np.testing.assert_array_equal(alone.shift[2:], beside.shift[3:])
+    np.testing.assert_array_equal(alone.scale[2:], beside.scale[3:])

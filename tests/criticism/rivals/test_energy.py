@@ -8,6 +8,7 @@ from sbi.utils import BoxUniform
 from sbi_active import GaussianNoise, SimulatorModel
 from sbi_active.criticism import Criticism, Trials
 from sbi_active.criticism.forces import force_effects, total_force
+from sbi_active.criticism.rivals import coordinates
 from sbi_active.criticism.rivals.coordinates import dissipative_bounds
 
 STEP, NUM = 0.02, 100
@@ -64,27 +65,21 @@ def test_only_what_outgrows_damping_and_drives_is_bounded(forces):
     assert rest == {"v|v| of hinge", "v^3 of hinge"}
 
 
-def test_quadratic_damping_that_feeds_energy_is_never_adopted(pushed, forces):
-    kinds = ["v|v| of hinge", "v of hinge", "sin 2q of hinge", "q^3 of hinge"]
-    loop = Criticism(
-        model(0.003), PRIOR, pushed, effects=[forces[name] for name in kinds]
-    )
-    tracing = loop.trace()
-    assert "v|v| of hinge" not in tracing.chosen
+KINDS = [f"{form} of hinge" for form in ("v|v|", "v", "sin 2q", "q^3")]
+FREE = pytest.param(False, marks=pytest.mark.slow)
+
+
+@pytest.mark.parametrize("is_bounded", [True, FREE])
+def test_damping_that_feeds_energy_is_never_adopted(
+    is_bounded, pushed, forces, monkeypatch
+):
+    if not is_bounded:
+        everywhere = (np.full(1, -np.inf), np.full(1, np.inf))
+        monkeypatch.setattr(coordinates, "dissipative_bounds", lambda e: everywhere)
+    effects = [forces[name] for name in KINDS]
+    tracing = Criticism(model(0.003), PRIOR, pushed, effects=effects).trace()
+    assert (KINDS[0] in tracing.chosen) != is_bounded
     for evidence in tracing.evidences.values():
-        if "v|v| of hinge" in evidence.names:
-            at = evidence.names.index("v|v| of hinge")
+        if is_bounded and KINDS[0] in evidence.names:
+            at = evidence.names.index(KINDS[0])
             assert (evidence.draws[:, at] <= 1e-9).all()
-
-
-@pytest.mark.slow
-def test_without_the_bound_it_would_be(pushed, forces, monkeypatch):
-    free = lambda e: (np.full(e.phi_dim, -np.inf), np.full(e.phi_dim, np.inf))  # noqa: E731
-    monkeypatch.setattr(
-        "sbi_active.criticism.rivals.coordinates.dissipative_bounds", free
-    )
-    kinds = ["v|v| of hinge", "v of hinge", "sin 2q of hinge", "q^3 of hinge"]
-    loop = Criticism(
-        model(0.003), PRIOR, pushed, effects=[forces[name] for name in kinds]
-    )
-    assert "v|v| of hinge" in loop.trace().chosen
