@@ -25,7 +25,7 @@ from sbi_active.criticism.effects.effect import Effect
 from sbi_active.criticism.effects.joint_prior import joint_prior
 from sbi_active.criticism.evidence.rival_set import RivalSet
 from sbi_active.criticism.linear.screening import linear_models
-from sbi_active.criticism.misfit.contrary import judged, widened
+from sbi_active.criticism.misfit.contrary import judged
 from sbi_active.criticism.misfit.evaluation import evaluate_held_out, evaluate_left_out
 from sbi_active.criticism.misfit.record import traced
 from sbi_active.criticism.misfit.rule import Rule
@@ -228,8 +228,6 @@ class Criticism:
         with stage("verdict, sets of effects fitted", show_progress=self.show_progress):
             actions = None if large else self.actions  # the next action looks for more
             tracing, models = traced(found, held_out, actions=actions, near=not large)
-        if tracing.misfit is None:
-            tracing = widened(tracing, models)
         return replace(tracing, set_aside=self.set_aside), models
 
     def add(

@@ -116,9 +116,9 @@ class Evidence:
             squares, "smc" (sequential Monte Carlo), or "linear".
         names: Names of the coordinates (theta, phi).
         draws: Posterior draws of (theta, phi), shape (m, dim).
-        narrow: Draws by this model alone, where ``draws`` were widened; or None.
         best_chi_square: Smallest whitened residual sum of squares among the draws.
-        best: Theta and phi, (dim,), that predict other trials; None for the draws.
+        best: Best fit of theta and phi, (dim,), of a model that misses, whose draws are
+            wide; or None.
     """
 
     key: ModelKey
@@ -130,7 +130,6 @@ class Evidence:
     draws: Array
     best_chi_square: float
     best: Array | None = None
-    narrow: Array | None = None
 
     @property
     def name(self) -> str:

@@ -275,7 +275,6 @@ class RivalSet:
         sample: WeightedDraws,
         u: Array,
         chi_square: float,
-        best: Array | None = None,
     ) -> Evidence:
         """Return the record of a rival.
 
@@ -284,7 +283,6 @@ class RivalSet:
             sample: Sample of its posterior.
             u: Draws that are shown, shape (n, dim).
             chi_square: Smallest whitened residual sum of squares.
-            best: Point from which other trials are predicted; None for the draws.
         """
         c, own = rival.coordinates, rival.coordinates.num_own
         return Evidence(
@@ -295,7 +293,6 @@ class RivalSet:
             engine=sample.method,
             names=self.names_of(rival),
             draws=c.to_z(u)[:, :own],
-            best=None if best is None else c.to_z(best[None])[0, :own],
             best_chi_square=chi_square,
         )
 

@@ -141,46 +141,6 @@ def withdrawn(tracing: Tracing) -> Tracing:
     )
 
 
-def widened(tracing: Tracing, rivals: RivalSet) -> Tracing:
-    r"""Return a verdict whose refuted models have draws that know of it.
-
-    The posterior of a model that misses the trials is as narrow as the sensor allows,
-    about a wrong place. Draws of one that is behind the verdict's by a Bayes factor of
-    20 are spread by the root of the ratio of both chi-squares (Birge), and moved by
-    what separates both models' means, :math:`(\bar u_v - \bar u)\, n` with a standard
-    normal n for each draw: the verdict's effects, left out, shift what is left.
-
-    Args:
-        tracing: Tracing with effects as the verdict.
-        rivals: The models, for bounds of priors.
-
-    References:
-        Birge, Physical Review 40 (1932), for the ratio.
-    """
-    best = tracing.evidences.get(str(ModelKey(tracing.chosen)))
-    if not tracing.chosen or best is None:
-        return tracing
-    found = dict(tracing.evidences)
-    known = dict(zip(best.names, best.draws.mean(0), strict=True))
-    for name, own in tracing.evidences.items():
-        near = own.log_evidence > best.log_evidence - THRESHOLD
-        if near or own.key.error is not None:
-            continue
-        ratio = max(own.best_chi_square / max(best.best_chi_square, 1.0), 1.0)
-        mean = own.draws.mean(0)
-        center = [known.get(n, m) for n, m in zip(own.names, mean, strict=True)]
-        rng = np.random.default_rng(derive_seed(rivals.seed, "refuted", name))
-        moved = rng.normal(size=(len(own.draws), 1)) * (np.array(center) - mean)
-        draws = mean + np.sqrt(ratio) * (own.draws - mean) + moved
-        draws = rivals.rival(own.key).coordinates.within(draws)
-        found[name] = replace(own, draws=draws, narrow=own.draws)
-    estimates = []
-    for one in tracing.estimates:
-        phi = found[one.name].draws[:, -len(one.mean) :]
-        estimates.append(replace(one, mean=phi.mean(0), sd=phi.std(0)))
-    return replace(tracing, evidences=found, estimates=(*estimates,))
-
-
 #: Draws of a posterior that say whether it lies at a bound, and steps of a refit.
 NUM_DRAWS, STEPS = 400, 30
 

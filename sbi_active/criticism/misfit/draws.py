@@ -30,13 +30,29 @@ def posterior(found: Verdict, models: RivalSet, key: ModelKey) -> Fit:
 
     The bare model and those that are likely have samples of the simulator's own
     posterior where they bend and no model misses; of few effective draws
-    a linear model's, since a few would claim to know what is open.
+    a linear model's, since a few would claim to know what is open. What is shown of a
+    model that misses knows that it does, whichever model explains.
 
     Args:
         found: Verdict with the model.
         models: The verdict's models, with the bare one's posterior where it is known.
         key: Key of the model.
     """
+    fit = _predicting(found, models, key)
+    if not found.misses(key):
+        return fit
+    search, c = found.search, fit.rival.coordinates
+    model = search.model(found.states.predicting(key))
+    rng = np.random.default_rng(derive_seed(models.seed, "linear", str(model.key)))
+    u = model.draws(model.u, found.shown(model.key), NUM_DRAWS, rng)
+    u = np.concatenate([model.u[None], u])
+    best, *draws = c.to_z(u)[:, : c.num_own]
+    own = replace(fit.evidence, draws=np.array(draws), best=best)
+    return replace(fit, evidence=own)
+
+
+def _predicting(found: Verdict, models: RivalSet, key: ModelKey) -> Fit:
+    """Return a model with the draws that predict other trials."""
     if not found.is_missed and _is_sampled(found, key):
         near = found.search.model(key).u[None] if key.effects else None
         fit = models.sampled(key, near)
@@ -143,9 +159,9 @@ def _linear(
         u, spread = drawn(best, found.covariance(key)), spread_of(found, key, use)
     else:
         at = states.mixture(key, use)
-        log_z = at.log_evidence
-        if key.effects and found.key == ModelKey(key.effects, OUTLIER):
-            at = states.mixture(found.key, use)
+        log_z, beside = at.log_evidence, found.beside(key)
+        if beside.error == OUTLIER:
+            at = states.mixture(beside, use)
         if use is not None and np.isfinite(search.sensor.df):
             model, at = by_weights(model, search, use)
         u, linear = drawn(at.mean, at.cov), partial(_residual, search.unit, model)
@@ -160,9 +176,7 @@ def _linear(
         effective_sample_size=float(NUM_DRAWS),
         method="linear",
     )
-    if found.is_missed and use is None:
-        u = drawn(model.u, found.shown(key))
-    evidence = models.record(rival, sample, u, square, best)
+    evidence = models.record(rival, sample, u, square)
     return Fit(rival, sample, evidence, best, mode, linear, known, spread)
 
 

@@ -9,16 +9,18 @@ for independent from trial to trial. The covariance is
 
 with that of generalized least squares given a residual process, or a parameter that
 differs from trial to trial, of which a part is shared by the trials. What weighting the
-same residuals differently moves parameters by is an error of them too. It is one
-matrix, in which parameters make up for each other as they do in the trials, so that
-predictions follow from it. Intervals have the variance
+same residuals differently moves parameters by is an error of them too; beyond a bound
+of the prior as well, where the fit stays. It is one matrix, in which parameters make up
+for each other as they do in the trials, so that predictions follow from it. Intervals
+have
 
 .. math::
-    s^2 = \max_m \max(\Sigma_m, s_{J, m}^2) + \max_m (\hat u_m - \hat u)^2
+    \Sigma + \Sigma_J + \sum_m p_m (\hat u_m - \hat u) (\hat u_m - \hat u)^T
 
-with the jackknife's, :math:`s_J`, and the models m that have further effects and
-predict left-out trials better: something undeclared may be what they take up. The
-center is that of least squares, which predicts new trials better.
+with the jackknife's, which knows no process, and the models m that have further
+effects, as probable as they are beside a process: something undeclared may be what
+they take up. On tuning seeds of ``benchmarks/misfit`` each term is needed. The center
+is that of least squares, which predicts new trials better.
 """
 
 from __future__ import annotations
@@ -40,23 +42,14 @@ def covariance(own: Candidate, errors: Errors, action: Array) -> Array:
     """Return the covariance of a model's coordinates about its best fit, (d, d).
 
     Args:
-        own: Fitted model. Its jackknife tells as well where trials are few, or are not
-            sampled at the same times.
+        own: Fitted model.
         errors: Errors that all models share.
         action: Action of each trial, shape (t, action_dim).
     """
-    model, given = own.model, own.beside
-    found = shared_process(model, errors, action)
-    mean, cov = found or (given.mean, given.cov + own.left.jackknife())
-    apart = model.u - np.clip(mean, model.low, model.high)
+    given = own.beside.mean, own.beside.cov
+    mean, cov = shared_process(own.model, errors, action) or given
+    apart = own.model.u - mean
     return cov + np.outer(apart, apart)
-
-
-def widened(cov: Array, variance: Array, model: LinearModel) -> Array:
-    """Return a covariance with other variances, (d, d), at most the prior's."""
-    sd = np.minimum(np.sqrt(variance), model.widened(WIDTHS[-1]))
-    ratio = sd / np.sqrt(np.maximum(np.diag(cov), 1e-300))
-    return cov * np.outer(ratio, ratio)
 
 
 def shared_process(

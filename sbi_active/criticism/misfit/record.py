@@ -239,9 +239,9 @@ def _held_out(models: RivalSet, key: ModelKey, held_out: Trials) -> Array:
 
 
 def _estimates(found: Verdict, evidences: dict[str, Evidence]) -> tuple[Estimate, ...]:
-    """Return each effect by the draws of the model that has it alone, likeliest first.
+    """Return each effect by the model that has it alone, likeliest first.
 
-    Its phi is the end of the draws.
+    Its phi is the end of the draws, and of the best fit of a model that misses.
     """
     bare, estimates = evidences[str(ModelKey())].log_evidence, []
     for name, effect in found.rivals.effects.items():
@@ -249,6 +249,7 @@ def _estimates(found: Verdict, evidences: dict[str, Evidence]) -> tuple[Estimate
             continue
         own = evidences[name]
         phi = own.draws[:, -effect.phi_dim :]
+        center = phi.mean(0) if own.best is None else own.best[-effect.phi_dim :]
         estimate = Estimate(
             name=name,
             family=str(effect.family),
@@ -256,7 +257,7 @@ def _estimates(found: Verdict, evidences: dict[str, Evidence]) -> tuple[Estimate
             describe=effect.describe or "",
             probability=found.inclusion[name],
             log_bayes_factor=own.log_evidence - bare,
-            mean=phi.mean(0),
+            mean=center,
             sd=phi.std(0),
             effective_sample_size=own.effective_sample_size,
             engine=own.engine,

@@ -25,7 +25,7 @@ from sbi_active.criticism.linear.model import LinearModel
 from sbi_active.criticism.linear.search import Search
 from sbi_active.criticism.linear.states import States
 from sbi_active.criticism.misfit.guesses import gained_by_guesses
-from sbi_active.criticism.misfit.intervals import covariance, widened
+from sbi_active.criticism.misfit.intervals import covariance
 from sbi_active.criticism.misfit.rule import Choice, Compared, Rule
 from sbi_active.criticism.misfit.scored import Scored
 from sbi_active.criticism.results import (
@@ -267,28 +267,28 @@ class Verdict:
         """Return whether a model's chi-square passes against the sensor."""
         return self.model(key).chi_square[2] > self.rule.passes
 
+    def beside(self, key: ModelKey) -> ModelKey:
+        """Return a model in its most probable state of the error, if it has none."""
+        has_one = key.error is not None or self.states.louder(key)
+        return key if has_one else self.states.likeliest(key)
+
+    def misses(self, key: ModelKey) -> bool:
+        """Return whether a model misses the trials by more than the sensor's error."""
+        misses = self.beside(key).error in (SCATTER, UNEXPLAINED)
+        return self.is_missed or (self.search.sensor.is_known and misses)
+
     def shown(self, key: ModelKey) -> Array:
         """Return the covariance that intervals of a model's coordinates have, (d, d).
 
-        It has what larger models say that predict left-out trials better.
+        It has what larger models say, and the jackknife.
         """
         search, own = self.search, self.search.found[key]
-        larger = [k for k in search.found if {*k.effects} > {*key.effects}]
-        errors = {k: search.found[k].left.mean_square for k in larger}
-        better = [k for k in larger if errors[k] < own.left.mean_square]
-        variance, away = self._variance(key), np.zeros_like(own.model.u)
-        for other in better:
-            at = search.columns(other, key)
-            away = np.maximum(away, (self.model(other).u[at] - own.model.u) ** 2)
-        if better:
-            best = min(better, key=errors.__getitem__)
-            its = self._variance(best)[search.columns(best, key)]
-            variance = np.maximum(variance, its)
-        return widened(self.covariance(key), variance + away, own.model)
-
-    def _variance(self, key: ModelKey) -> Array:
-        jackknife = self.search.found[key].left.jackknife()
-        return np.maximum(np.diag(self.covariance(key)), np.diag(jackknife))
+        larger = [k for k in search.found if {*k.effects} >= {*key.effects}]
+        log_p = np.array([search.found[k].log_p for k in larger])
+        away = np.array([self.model(k).u[search.columns(k, key)] for k in larger])
+        away = away - own.model.u
+        spread = away.T * np.exp(log_p - log_sum_exp(log_p)) @ away
+        return self.covariance(key) + own.left.jackknife() + spread
 
     def covariance(self, key: ModelKey) -> Array:
         """Return the covariance of a model's coordinates about its best fit, (d, d).

@@ -270,12 +270,10 @@ def root_mean_square(x: Array, axis: int | tuple[int, ...] | None = None) -> Arr
 def _moments(evidence: Evidence, when: str) -> pd.DataFrame:
     """Return mean and deviation of each parameter in a model.
 
-    Of one that misses the trials draws are spread by the misfit, and moved within the
-    prior: their mean is no fit.
+    Draws of one that misses the trials are within the prior: their mean is no fit.
     """
-    draws = evidence.draws if evidence.narrow is None else evidence.narrow
     num = len(evidence.names)
-    center = [column.mean() for column in draws.T[:num]]
-    center = center if evidence.best is None else evidence.best[:num]
-    sd = [column.std() for column in evidence.draws.T[:num]]
-    return pd.DataFrame({when: center, f"{when}_sd": sd}, index=[*evidence.names])
+    draws, best = evidence.draws[:, :num], evidence.best
+    center = draws.mean(0) if best is None else best[:num]
+    values = {when: center, f"{when}_sd": draws.std(0)}
+    return pd.DataFrame(values, index=[*evidence.names])
