@@ -99,6 +99,6 @@ print(campaign.belief)
 print("simulated", campaign.state.meter.spent, "of", options.max_simulations)
 
 # %% [markdown]
-# With `directory="folder"` and `workers=Workers(8, time_limit=600)` these rows are kept, run
-# side by side and given up after ten minutes: see [how
+# With `directory="folder"` and `workers=Workers(8, time_limit=600)` these rows are
+# kept, run side by side and given up after ten minutes: see [how
 # many](../howto/how_many_simulations.md).

@@ -76,8 +76,10 @@ def browser(folder: Path, *flags: str):
         options = {"binary": CHROMIUM, "args": own}
         wanted = {"alwaysMatch": {"goog:chromeOptions": options}}
         session = said(f"{base}/session", {"capabilities": wanted})["sessionId"]
-        yield Browser(f"{base}/session/{session}")
-        said(f"{base}/session/{session}", None, "DELETE")
+        try:
+            yield Browser(f"{base}/session/{session}")
+        finally:  # which ends the browser
+            said(f"{base}/session/{session}", None, "DELETE")
     finally:
         driver.terminate()
         driver.wait(timeout=60)

@@ -85,7 +85,7 @@ def numbers(tensor: Tensor) -> Any:
 
 
 #: What a file may have called, besides what torch makes tensors by.
-CALLED = made, given, few, numbers, Message, frozenset
+CALLED = made, given, few, numbers, Message, set, frozenset
 PLAIN = set, frozenset, OrderedDict, torch.Size, torch.dtype, torch.nn.Parameter
 NAMED = {
     *(*CALLED, *PLAIN, *torch._storage_classes),

@@ -100,6 +100,14 @@ def test_a_file_has_nothing_else_called(tmp_path):
         decode(written(torch.distributions.Normal(0.0, 1.0)), known={})
 
 
+def test_state_is_set_as_it_is_and_never_by_a_method():
+    options = "sbi_active.campaign.options:CampaignOptions"  # whose __setstate__ loads
+    bomb = pickle.dumps(Called(os.mkdir, "exploded"))
+    state = {"density_estimator": bomb}
+    assert decode(written(Called(codec.made, options, state)), known={})
+    assert not os.path.exists("exploded")
+
+
 def test_fields_that_came_later_have_their_defaults():
     kind = "sbi_active.campaign.state:Trial"
     old = Called(codec.made, kind, {"index": 3, "action": None})
