@@ -318,7 +318,7 @@ class ActionRounds(ActiveInference):
                 is lost and what is left is all success.
             action: Actions, shape (n, action_dim), or (action_dim,) for all rows.
             belief: The distribution of theta in this round; None is the current one.
-            kwargs: The same by name.
+            kwargs: Keyword arguments of that method.
 
         Returns:
             The trainer, so that calls chain.
