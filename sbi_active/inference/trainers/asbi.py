@@ -26,11 +26,11 @@ from sbi_active.inference.beliefs.belief import (
     compare,
 )
 from sbi_active.inference.beliefs.priors import require_support
+from sbi_active.inference.emulation.refining import refine
 from sbi_active.inference.engine.learned import LearnedBelief
 from sbi_active.inference.models.posterior import ActionPosterior
 from sbi_active.inference.networks.mixture_density import TrainingRecord
 from sbi_active.inference.networks.mixture_network import MixtureDensityNetwork
-from sbi_active.inference.refinement.refining import refine
 from sbi_active.inference.rounds.condition import pack
 from sbi_active.inference.rounds.rows import Observation
 from sbi_active.inference.trainers.action_rounds import extends
