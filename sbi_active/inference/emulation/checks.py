@@ -11,12 +11,13 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy.stats import chi2, kurtosis
+from scipy.stats import binom, chi2, kurtosis
 
 from sbi_active.arrays import Array
 from sbi_active.inference.beliefs.diagnostics import Diagnostics
 from sbi_active.inference.declared.diagnosing import Doubt, judged
 from sbi_active.inference.emulation.emulator import EmulatedLikelihood
+from sbi_active.inference.emulation.pool import TrialRows
 from sbi_active.inference.emulation.regression import Regression, is_misfit
 from sbi_active.inference.emulation.stages import EmulationSettings, Stage
 
@@ -194,7 +195,7 @@ def diagnosed(
     own: EmulationSettings,
     tails: list[float],
     fresh: Fresh | None,
-    share_invalid: float,
+    rows: Sequence[TrialRows],
     shape_change: float,
     rng: np.random.Generator,
     **known: Any,
@@ -206,7 +207,7 @@ def diagnosed(
         own: Settings of the loop.
         tails: Tail probabilities of the trials and, last, of all together.
         fresh: What fresh simulations say of the last stage.
-        share_invalid: Share of the simulations without what was observed.
+        rows: Simulations of each trial.
         shape_change: Nats by which noise that is not Gaussian changed the belief.
         rng: Source of the errors of few simulations.
         known: Further diagnostics.
@@ -225,17 +226,18 @@ def diagnosed(
     figures: dict[str, Any] = {"num_stages": num, "prior_edge_mass": edge_mass}
     details, explained = {}, last.error
     if fresh is not None:
-        doubts |= _regressed(stages, own, fresh, shape_change)
+        doubts |= _regressed(stages, own, fresh, shape_change, agreement(last, rows))
         share = [1.0] * (len(tails) - 1)
         for k, outcome in last.learned.outcomes.items():
             share[k] = float(np.exp(outcome.log_prob(last.draws)).mean())
-        rare = [str(k) for k, p in enumerate(share) if p < own.rare]
+        rare = [k for k, p in enumerate(share) if p < own.rare]
         doubts["outcomes_usual"] = not rare, min(share)
-        details = {"rare": ", ".join(rare)}
+        details = {"rare": ", ".join(map(str, rare))}
         parts = last.learned.parts
         errors = [part.error(last.draws, rng, explained=True) for part in parts]
         explained = float(sum(errors))
-        figures |= {"share_invalid": share_invalid, "probability_of_outcome": share}
+        invalid = float(np.mean([own.share_invalid for own in rows]))
+        figures |= {"share_invalid": invalid, "probability_of_outcome": share}
     return judged(
         *(doubts, details, tails, edge_mass),
         effective_sample_size=float(last.fit.effective_sample_size),
@@ -246,8 +248,32 @@ def diagnosed(
     )
 
 
+def agreement(stage: Stage, rows: Sequence[TrialRows]) -> float:
+    """Return the probability that so few simulations have outcomes as all trials had.
+
+    Each trial's, a measurement or none, may be usual somewhere and all of them nowhere.
+    Where trials do not share their simulations, 1.
+
+    Args:
+        stage: The stage that gives the probabilities.
+        rows: Simulations of each trial.
+    """
+    z = rows[0].z
+    if not all(np.array_equal(own.z, z) for own in rows):
+        return 1.0
+    chance, inside = np.zeros(len(z)), stage.learned.region.contains(z)
+    for outcome in stage.learned.outcomes.values():
+        chance += outcome.log_prob(z)
+    agrees = np.all([own.agrees for own in rows], axis=0)[inside]
+    return float(binom.cdf(agrees.sum(), len(agrees), np.exp(chance[inside]).mean()))
+
+
 def _regressed(
-    stages: Sequence[Stage], own: EmulationSettings, fresh: Fresh, shape_change: float
+    stages: Sequence[Stage],
+    own: EmulationSettings,
+    fresh: Fresh,
+    shape_change: float,
+    agreement: float,
 ) -> dict[str, Doubt]:
     """Return what regressions take for granted."""
     last = stages[-1].learned
@@ -266,6 +292,7 @@ def _regressed(
     limit = max(own.largest_shift, 3.0 * fresh.deviation)
     depends = fresh.correlation >= own.correlated and not is_misfit(excess)
     blur = max((outcome.blur for outcome in last.outcomes.values()), default=0.0)
+    is_followed = blur <= own.blurred and agreement >= own.rare
     ratio = max((fit.ratio for fit in fits), default=0.0)
     return {
         "confirmed": (fresh.shift <= limit, fresh.shift),
@@ -274,5 +301,5 @@ def _regressed(
         "smooth_response": (roughness <= own.rough, roughness),
         "no_misfit": (excess <= own.misfit, ratio),
         "independent_trials": (not depends, fresh.correlation),
-        "outcomes_followed": (blur <= own.blurred, blur),
+        "outcomes_followed": (is_followed, blur),
     }

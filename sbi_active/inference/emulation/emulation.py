@@ -144,9 +144,8 @@ class Emulation:
         if own.shapes is not None:
             stages[-1] = self._shaped(stages[-1], own.shapes)
         tails = self._tails(stages[-1])
-        invalid = [rows.share_invalid for rows in self._rows()]
         stages[-1].belief.diagnostics = diagnosed(
-            *(stages, own, tails, self.fresh, float(np.mean(invalid))),
+            *(stages, own, tails, self.fresh, self._rows()),
             *(self._shape_change, self.rng),
             num_simulations=self.pool.num_drawn - self._at_start,
             num_missing=self.pool.num_missing,
@@ -199,15 +198,19 @@ class Emulation:
         groups: Any = [range(len(self.trials))]
         errors = np.ones(1)
         if stages and stages[-1].learned.groups:
-            groups, errors = stages[-1].learned.groups, stages[-1].errors[:-1] + 1e-9
+            groups, errors = [*stages[-1].learned.groups], stages[-1].errors[:-1] + 1e-9
+            # Where others have no measurement is looked at beside the first.
+            others = {*range(len(self.trials))} - {k for group in groups for k in group}
+            groups[0] = (*groups[0], *others)
         counts = self.rng.multinomial(size, errors / errors.sum())
         parts: list[tuple[Any, ...]] = []
         for group, count in zip(groups, counts, strict=True):
             action = torch.stack([self.trials[k].action for k in group]).unique(dim=0)
             num = int(count) // len(action)
             if not stages and len(self.pool):  # known from the trials before
-                num -= min(len(self.pool.at(place)) for place in action)
-            if num <= 0:
+                is_new = [len(self.pool.at(place)) < num for place in action]
+                action = action[torch.tensor(is_new)]
+            if num == 0 or not len(action):
                 continue
             repeated = max(int(own.replicate_share * num), least_repeated)
             repeated = min(repeated, num // 2) if own.replicate_share else 0
@@ -305,11 +308,11 @@ class Emulation:
 
     def _tails(self, stage: Stage) -> list[float]:
         """Return tail probabilities of the trials and, last, of all together."""
-        own, c, trials = self.own, self.coordinates, self.trials
-        if own.checked_share == 0:
+        c, trials = self.coordinates, self.trials
+        if self.own.checked_share == 0:
             return predicted_tails(stage.learned, stage.draws, len(trials))
-        num = int(own.checked_share * self.settings.num_histories)
-        num = max(own.least_checked, num)
+        num = int(self.own.checked_share * self.settings.num_histories)
+        num = max(self.own.least_checked, num)
         theta, t = c.to_theta(stage.fit.draws(num, self.rng)), len(trials)
         action = torch.stack([trial.action for trial in trials]).repeat(num, 1)
         seed = derive_seed(self.seed, "fresh")

@@ -8,12 +8,10 @@ The numbers of a trial are modeled as
 
 with f a basis in coordinates u (:mod:`.solving`), S the covariance of the residuals,
 which holds the noise and what f misses, and h the leverage, by which the likelihood
-widens where simulations are few. Of many numbers most are noise: only combinations of
-them that parameters change have coefficients, so that the others add no error.
+widens where simulations are few.
 
 References:
-    Wood, Nature 2010 (synthetic likelihood); Izenman, J. Multivar. Anal. 5 (1975)
-    (reduced rank).
+    Wood, Nature 2010 (synthetic likelihood).
 """
 
 from __future__ import annotations
@@ -34,37 +32,34 @@ from sbi_active.inference.sampling.mixtures import log_student
 
 @dataclass(frozen=True)
 class Block:
-    r"""The numbers of one trial, whitened and rotated to those that parameters change.
+    r"""The numbers of one trial, whitened.
 
     Attributes:
-        kept: Map of numbers less the observed ones to those that change, (q, r).
-        rest: Map to the others, which are noise alone, shape (q, q - r).
-        coefficient: Coefficients of what is kept, less observed, shape (p, r).
-        mean: Means of the rest, less observed, shape (q - r,).
+        white: Map of numbers less the observed ones to white ones, shape (q, q).
+        coefficient: Coefficients of these, shape (p, q).
         freedom: Degrees of freedom of their density.
         share: Factor of the variance of a density of so few.
-        log_volume: Log determinant of the inverse map.
     """
 
-    kept: Array
-    rest: Array
+    white: Array
     coefficient: Array
-    mean: Array
     freedom: float
     share: float
-    log_volume: float
 
     def log_likelihood(self, rows: Array, widening: Array) -> Array:
         """Return log likelihoods of features (n, p), wider by factors (n,)."""
-        num, size = self.coefficient.shape[1], len(self.kept)
-        square = ((rows @ self.compact) ** 2).sum(1) / widening
-        square = (square + self.mean @ self.mean) / self.share
-        volume = 0.5 * (num * np.log(widening) + size * np.log(self.share))
-        return log_student(square, volume + self.log_volume, size, self.freedom)
+        wider, size = self.share * widening, len(self.white)
+        square = ((rows @ self.compact) ** 2).sum(1) / wider
+        log_volume = 0.5 * size * np.log(wider) - np.linalg.slogdet(self.white)[1]
+        return log_student(square, log_volume, size, self.freedom)
 
     @cached_property
     def compact(self) -> Array:
-        """Fewest numbers whose squares add up to those of what is kept, (p, k)."""
+        """Fewest numbers whose squares add up to those of the white ones, (p, k).
+
+        An orthogonal map of these, many of which are linear in others where there are
+        more numbers than features.
+        """
         own = self.coefficient
         return own if own.shape[1] <= len(own) else np.linalg.qr(own.T)[1].T
 
@@ -140,51 +135,33 @@ class Regression:
         pairs = pairs[(apart <= closest) | np.isinf(region.reach)]
         rounding = float(np.finfo(np.float32).eps) * np.abs(x + observed).max(0)
 
-        def noise_of(numbers: Array) -> Array:
-            if len(pairs) < fewest_pairs:
-                return np.full(numbers.shape[1], np.inf)
-            gap = numbers[pairs[:, 0]] - numbers[pairs[:, 1]]
-            return 0.5 * (gap**2).mean(0) + 1e-300
-
-        noise = noise_of(x) + rounding**2
+        noise = np.full(x.shape[1], np.inf)
+        if len(pairs) >= fewest_pairs:
+            gap = x[pairs[:, 0]] - x[pairs[:, 1]]
+            noise = 0.5 * (gap**2).mean(0) + rounding**2 + 1e-300
         own, polynomial = best_solved(region, z, x, noise)
         roughness = 0.0
         if np.isfinite(noise).all():
             share = (polynomial.square - noise) / np.maximum(x.var(0), noise)
             roughness = float(share.max(initial=0.0))
-        rows, shape = region.distance(z) <= own.basis.reach, None
-        x_near = x[rows][own.near]
+        shape = None
         if shapes is not None:
+            rows = region.distance(z) <= own.basis.reach
             f = own.basis(z[rows])
             rest = x[rows] - f @ own.coefficient
             shape = NoiseShape.fit(f, own.coefficient, rest, observed, trial, shapes)
-        first, _ = own.covariance(trial, noise)
-        turned = [own.turned(*block) for block in first.maps]
-        if any(num < len(turn) for turn, num in turned):
-            shape = None  # sums of many numbers are nearly normal
-        # Of fewer numbers, each of which matters, more can be learned.
-        pairs_of_maps = [*zip(first.maps, turned, strict=True)]
-        x_kept = [x[:, own] @ turn[:, :num] for (own, _), (turn, num) in pairs_of_maps]
-        trial = np.repeat(np.arange(len(turned)), [num for _, num in turned])
-        kept = np.concatenate(x_kept, 1)
-        noise = noise_of(kept)
-        own, _ = best_solved(region, z, kept, noise)
         covariance, standardized = own.covariance(trial, noise)
-        blocks = []
-        for k, ((members, _), (turn, num)) in enumerate(pairs_of_maps):
-            inner, inverse = covariance.maps[k]
-            full = np.concatenate([turn[:, :num] @ inverse, turn[:, num:]], 1)
-            blocks.append(
-                Block(
-                    kept=full[:, :num],
-                    rest=full[:, num:],
-                    coefficient=own.coefficient[:, inner] @ inverse,
-                    mean=x_near[:, members].mean(0) @ full[:, num:],
-                    freedom=first.freedoms[k],
-                    share=first.freedom / first.freedoms[k],
-                    log_volume=-float(np.linalg.slogdet(full)[1]),
-                )
+        blocks = [
+            Block(
+                white=white,
+                coefficient=own.coefficient[:, members] @ white,
+                freedom=freedom,
+                share=covariance.freedom / freedom,
             )
+            for (members, white), freedom in zip(
+                covariance.maps, covariance.freedoms, strict=True
+            )
+        ]
         ratio, left = own.square / noise, own.freedom(int(own.near.sum()))
         white = covariance.whiten(own.residual[own.near])
         return Regression(
@@ -206,23 +183,19 @@ class Regression:
     def residual(self, z: Array, place: int) -> tuple[Array, Array]:
         """Return the whitened prediction less the observed, and its variance.
 
-        The variance counts the noise as 1; both are of shape (n, q).
+        The variance counts the noise as 1; of shapes (n, q) and (n, 1).
 
         Args:
             z: Coordinates, shape (n, d).
             place: Place of a trial among those of the regression.
         """
-        rows, block = self.basis(z), self.blocks[place]
+        rows = self.basis(z)
         leverage = ((rows @ self.root) ** 2).sum(1, keepdims=True)
-        mean = np.broadcast_to(block.mean, (len(z), len(block.mean)))
-        white = np.concatenate([rows @ block.coefficient, mean], 1)
-        varies = np.arange(white.shape[1]) < block.coefficient.shape[1]
-        return white, 1 + leverage * varies
+        return rows @ self.blocks[place].coefficient, 1 + leverage
 
     def whitened_outcomes(self, x: Array, place: int) -> Array:
         """Return numbers of a trial less the observed ones, whitened, shape (n, q)."""
-        block = self.blocks[place]
-        return np.concatenate([x @ block.kept, x @ block.rest], 1)
+        return x @ self.blocks[place].white
 
     def draw(self, z: Array, rng: np.random.Generator) -> Array:
         """Return whitened numbers at parameters (n, d) less the observed, (n, q)."""

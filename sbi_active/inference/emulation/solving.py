@@ -174,32 +174,6 @@ class Solved:
         own = ResidualCovariance.of(standardized, deviation, freedom, trial)
         return own, standardized
 
-    def turned(
-        self, members: NDArray[np.intp], inverse: Array, *, few: int = 2
-    ) -> tuple[Array, int]:
-        """Return a map of a trial's numbers to white ones, and how many matter.
-
-        Parameters change the first ones, and the others are noise. Those are found by
-        singular values beyond any of noise, where numbers are more than ``few`` a
-        parameter.
-
-        Args:
-            members: The numbers.
-            inverse: Map that whitens them.
-            few: Numbers a parameter.
-
-        References:
-            Gavish & Donoho, IEEE Trans. Inf. Theory 60 (2014).
-        """
-        q, dim = len(members), len(self.basis.region.center)
-        if q <= few * dim or len(self.root) == 1:
-            return inverse, q
-        known = np.linalg.solve(self.root, self.coefficient[:, members] @ inverse)[1:]
-        _, size, right = np.linalg.svd(known, full_matrices=False)
-        num = int((size > q**0.5 + len(known) ** 0.5 + 1).sum())
-        turn = np.linalg.qr(right[: max(num, 1)].T, mode="complete")[0]
-        return inverse @ turn, max(num, 1)
-
 
 def solved(
     basis: Basis,
@@ -247,7 +221,6 @@ def best_solved(
     more: float = 1.3,
     rough: float = 3.0,
     gain: float = 0.001,
-    closer: float = 0.0003,
 ) -> tuple[Solved, Solved]:
     """Return the polynomial that predicts left-out rows near the belief best.
 
@@ -264,7 +237,6 @@ def best_solved(
         most_waves: Number of cosines at most.
         more: Factor of the number of rows by which a further reach has to gain.
         gain: Nats a number that a higher degree must save.
-        closer: Nats a number that half of a reach must save.
         rough: Residual over noise variance of some number from which on cosines are
             tried.
     """
@@ -291,9 +263,8 @@ def best_solved(
             break
 
     def cost(fit: Solved) -> float:
-        """Return the score, and what is asked of a higher degree and a closer look."""
-        further = float(np.log2(fit.basis.reach / reaches[0]))
-        return fit.score + x.shape[1] * (gain * fit.basis.degree - closer * further)
+        """Return the score, and what is asked of a higher degree."""
+        return fit.score + gain * x.shape[1] * fit.basis.degree
 
     best = polynomial = min(fits, key=cost)
     if not (best.square > rough * noise).any():

@@ -37,15 +37,6 @@ def test_likelihood_of_a_linear_model(q: int):
     assert fit.caution() == 1
 
 
-def test_numbers_that_are_noise_alone_are_told():
-    """Sixty numbers of two parameters lie on a plane."""
-    fit, _ = regress(lambda z: z, q=60)
-    assert fit.blocks[0].coefficient.shape[1] == 2
-    white, spread = fit.residual(np.zeros((1, 2)), 0)
-    assert white.shape == spread.shape == (1, 60)
-    assert (spread[0, 2:] == 1).all()
-
-
 def test_misfit_is_told_from_noise():
     # No polynomial or smooth wave follows a step.
     fit, _ = regress(lambda z: np.sign(z - 0.1))
