@@ -23,7 +23,7 @@ from benchmarks.calibration.networks import shares
 from benchmarks.rows import benchmark
 from sbi_active.diagnostics import check_belief
 from sbi_active.inference.beliefs.belief import Belief
-from sbi_active.inference.refinement.refining import refine
+from sbi_active.inference.emulation.refining import refine
 from sbi_active.seeding import derive_seed, forked_generators
 from sbi_active.simulation import simulate
 from sbi_active.tasks import get_task

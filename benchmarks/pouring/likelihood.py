@@ -39,10 +39,10 @@ from scipy.ndimage import gaussian_filter
 from scipy.optimize import minimize
 from scipy.special import gammaln, logsumexp
 
-from sbi_active.inference.emulation.likelihood import correlation_root
+from sbi_active.inference.emulation.gains import correlation_root
+from sbi_active.inference.emulation.outcomes import TrialOutcome
+from sbi_active.inference.emulation.solving import whole_space
 from sbi_active.inference.emulation.summaries import Statistic, learned_statistic
-from sbi_active.inference.regression.outcomes import TrialOutcome
-from sbi_active.inference.regression.regions import whole_space
 from sbi_active.inference.sampling.gaussian_process import (
     GaussianProcess,
     ProcessSettings,
@@ -129,8 +129,8 @@ class ImageLikelihood:
         empty = filled = None
         if is_empty.any() and not is_empty.all():
             pairs, space = np.zeros((0, 2), dtype=bool), whole_space(z.shape[1])
-            empty = TrialOutcome.fit(space, 0, z, is_empty, pairs)
-            filled = TrialOutcome.fit(space, 0, z, ~is_empty, pairs)
+            empty = TrialOutcome.fit(space, z, is_empty, pairs)
+            filled = TrialOutcome.fit(space, z, ~is_empty, pairs)
         seen = ~is_empty
         if seen.sum() < FEWEST:
             none = np.zeros(0)

@@ -31,7 +31,7 @@ AREAS: dict[str, tuple[str, ...]] = {
     "campaign": ("tests/campaign/test_*.py",),
     "criticism": ("tests/criticism/test_*.py",),
     "effects_and_reports": ("tests/criticism/effects", "tests/criticism/report"),
-    "parameters": ("tests/inference/declared", "tests/inference/refinement"),
+    "parameters": ("tests/inference/declared", "tests/inference/emulation"),
     "threads_and_locks": tuple(
         f"tests/campaign/storage/test_{what}.py"
         for what in ("shared", "killed", "resume", "versions")

@@ -36,7 +36,7 @@ from sbi_active.diagnostics.log_score import smooth
 from sbi_active.expected import require, suggests
 from sbi_active.inference.beliefs.belief import names_of
 from sbi_active.inference.declared.settings import RefinementOptions
-from sbi_active.inference.refinement.refining import refine
+from sbi_active.inference.emulation.refining import refine
 from sbi_active.seeding import derive_seed, forked_generators
 from sbi_active.simulation import simulate
 

@@ -6,10 +6,10 @@ part it does. The choice of the next action is in ``design``.
 
 from sbi_active.inference.beliefs.belief import Belief
 from sbi_active.inference.declared.settings import RefinementOptions
+from sbi_active.inference.emulation.refining import refine
 from sbi_active.inference.models.lfire import LFIRE
 from sbi_active.inference.models.posterior import ActionPosterior
 from sbi_active.inference.networks.mixture_density import MixtureDensity
-from sbi_active.inference.refinement.refining import refine
 from sbi_active.inference.rounds.condition import ActionEmbedding
 from sbi_active.inference.trainers.asbi import ASBI
 from sbi_active.inference.trainers.base import ActiveInference

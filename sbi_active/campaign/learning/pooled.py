@@ -14,6 +14,7 @@ from torch.distributions import Distribution
 
 from sbi_active.actions import ActionSpace
 from sbi_active.actions.summaries import find_summaries
+from sbi_active.arrays import Array
 from sbi_active.campaign.learning.learner import Learner
 from sbi_active.campaign.learning.methods import find_method
 from sbi_active.campaign.score import score_outcome
@@ -22,10 +23,12 @@ from sbi_active.design.design import Design
 from sbi_active.design.elimination import choose
 from sbi_active.design.limits import DesignLimits
 from sbi_active.identifiability.known import note_combinations
-from sbi_active.inference.emulation.joint import candidate_gains
-from sbi_active.inference.emulation.pool import Pool
-from sbi_active.inference.emulation.processes import PooledTrial, Processes
-from sbi_active.inference.emulation.summaries import fitted_summaries
+from sbi_active.inference.emulation.emulation import Emulation
+from sbi_active.inference.emulation.gains import candidate_gains
+from sbi_active.inference.emulation.pool import EmulatedTrial, Pool
+from sbi_active.inference.emulation.stages import FEW_ROWS
+from sbi_active.inference.emulation.summaries import Summary, fitted_summaries
+from sbi_active.inference.sampling.coordinates import PriorCoordinates
 from sbi_active.seeding import derive_seed, forked_generators
 from sbi_active.simulation import SimulatorModel, simulate
 from sbi_active.simulation.noise.base import NoiseModel
@@ -92,24 +95,39 @@ class PooledLearner(Learner):
             simulator = simulator.without_noise()
         return Pool(simulator, self.state.batches, workers)
 
-    def _processes(self, *key: int | str) -> Processes:
-        return Processes(
-            self.prior,
-            self.pool,
-            self.noise,
-            tuple(self.x_shape),
-            fitted_summaries(self._choice, self.pool.rows.x),
-            self.state.options.refinement,
-            self.belief,
-            seed=derive_seed(self.state.seed, "pooled", *key),
+    @property
+    def _coordinates(self) -> PriorCoordinates:
+        return PriorCoordinates(self.prior, np.random.default_rng(0))
+
+    @property
+    def _summaries(self) -> list[Summary]:
+        return fitted_summaries(self._choice, self.pool.rows.x)
+
+    def _near(self, seed: int, *, num: int = 400) -> Array:
+        """Return coordinates of draws from the belief, shape (num, theta_dim)."""
+        with forked_generators(derive_seed(seed, "reference")):
+            theta = self.belief.sample(torch.Size([num]))
+        return self._coordinates.to_z(theta.float())
+
+    def _emulation(
+        self, trials: Sequence[EmulatedTrial], budget: int, *key: int | str
+    ) -> Emulation:
+        seed = derive_seed(self.state.seed, "pooled", *key)
+        return Emulation(
+            *(self.prior, self._coordinates, self.pool, trials, self._summaries),
+            *(self.state.options.refinement, FEW_ROWS),
+            budget=budget,
+            near=self._near(seed),
+            noise=self.noise,
+            seed=seed,
         )
 
-    def _trial(self, trial: Trial) -> PooledTrial:
+    def _trial(self, trial: Trial) -> EmulatedTrial:
         assert trial.x is not None
         label = None
         if self._choice is not None and self._choice.use == "chosen":
             label = self._choice.label(trial.action[self._entry])
-        return PooledTrial(self.simulated(trial.action), trial.x.float(), label)
+        return EmulatedTrial(self.simulated(trial.action), trial.x.float(), label)
 
     def _add(self, theta: Tensor, action: Tensor, belief: Distribution) -> None:
         seed = derive_seed(self.state.seed, "pool", len(self.state.batches))
@@ -219,18 +237,17 @@ class PooledLearner(Learner):
         self._add(self._drawn(num), places.repeat_interleave(counts, 0), self.belief)
 
     def _gains(self, places: Tensor, seed: int) -> tuple[Any, Any]:
-        processes = self._processes("design", seed)
         return candidate_gains(
             self.pool,
-            processes.near,
+            self._near(seed),
             places,
-            processes.summaries,
+            self._summaries,
             self.noise,
-            processes.coordinates,
+            self._coordinates,
             seed=seed,
         )
 
-    def _require_rows(self, trials: Sequence[PooledTrial], allowed: int) -> None:
+    def _require_rows(self, trials: Sequence[EmulatedTrial], allowed: int) -> None:
         """Simulate each trial's action where the pool has hardly any row of it.
 
         Raises:
@@ -259,18 +276,18 @@ class PooledLearner(Learner):
         state, start = self.state, self.state.meter.spent
         own = self._trial(trial)
         self._require_rows([own], self._rows_left("belief", trial.index))
-        processes = self._processes("score", trial.index)
-        near, label = processes.near, processes.best_summary(own)
-        fitted = processes.fit_trial(own, label, near)
+        emulation = self._emulation([own], 0, "score", trial.index)
+        near, label = emulation.near, emulation.best_summary(own)
+        fitted = emulation.alone(own, label)
         rng = np.random.default_rng(derive_seed(state.seed, "score", trial.index))
         state.account(trial.index, state.meter.spent - start, 0)
         z = near[rng.integers(len(near), size=size)]
-        if fitted.processes:
-            drawn = torch.from_numpy(fitted.draw(z, rng))
-            return score_outcome(torch.from_numpy(fitted.observed), drawn)
+        if fitted.parts:
+            drawn = torch.from_numpy(fitted.parts[0].draw(z, rng))
+            return score_outcome(torch.zeros(drawn.shape[1]), drawn)
         share = 1.0
-        if fitted.outcome is not None:
-            share = float(np.exp(fitted.outcome.log_prob(z)).mean())
+        for outcome in fitted.outcomes.values():
+            share = float(np.exp(outcome.log_prob(z)).mean())
         return (share if share < 0.5 else 1.0), math.log(share)
 
     def _prepare(self, index: int) -> None:
@@ -288,11 +305,10 @@ class PooledLearner(Learner):
         allowed, start = self._rows_left("belief", index), self.state.meter.spent
         self._require_rows(own, allowed)
         allowed -= self.state.meter.spent - start
-        processes = self._processes("belief", key)
-        processes.begin(own, max(allowed, 0))
-        belief = processes.run()
+        emulation = self._emulation(own, max(allowed, 0), "belief", key)
+        belief = emulation.run()
         if self._choice is not None:
-            for trial, label in zip(trials, processes.labels, strict=True):
+            for trial, label in zip(trials, emulation.labels, strict=True):
                 self.state.change(trial.index, summary=label)
         note_combinations(belief, self._names, seed=self.state.seed)
         self._trainer.resume(belief, [self._observation(t) for t in trials])

@@ -16,8 +16,7 @@ class RefinementOptions:
     Attributes:
         num_histories: Budget of simulated histories, replicates included; a history is
             a parameter set at which each executed action is simulated. Fewer are used
-            where the surrogate is good sooner. A trial that had a measurement is
-            simulated again, up to 16 times, where by chance simulations have none.
+            where the surrogate is good sooner.
             A simulated likelihood may take three times as many.
         num_effective: Number of effective draws that end the sampling of a simulated
             likelihood. The log density of the belief is off by about their number to

@@ -1,5 +1,5 @@
-"""Likelihoods learned from few simulations, which all trials and rounds share.
+"""Likelihoods learned from simulations: one pool, one loop, two ways to regress.
 
-Here live a pool of simulations and Gaussian processes on them. The loop that asks for
-more, samples and judges is that of ``refinement``.
+Here live the pool, regressions, interpolations, the loop that asks for more, and how
+far to trust its beliefs. No network is asked.
 """

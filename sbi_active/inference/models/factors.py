@@ -16,8 +16,8 @@ from typing_extensions import override
 from sbi_active.arrays import Array
 from sbi_active.inference.beliefs.diagnostics import Diagnostics
 from sbi_active.inference.declared.settings import RefinementOptions
+from sbi_active.inference.emulation.stages import EmulationSettings
 from sbi_active.inference.engine.learned import LearnedBelief, learned_fit
-from sbi_active.inference.refinement.stages import StageSettings
 from sbi_active.inference.rounds.condition import action_rows, outcome_rows, pack
 from sbi_active.inference.rounds.rows import Observation
 from sbi_active.inference.sampling.coordinates import PriorCoordinates
@@ -237,7 +237,7 @@ def sample_product(
     """
     prior, num = product.coordinates.prior, settings.num_effective
     near = None if hint is None else product.coordinates.to_z(hint)
-    num *= StageSettings().oversampling
+    num *= EmulationSettings().oversampling
     fit = learned_fit(product, rng, near=near, num_effective=num)
     belief = LearnedBelief(prior, fit, defensive=settings.defensive)
     belief.label = "product over trials"

@@ -21,8 +21,8 @@ from sbi_active.inference.beliefs.belief import (
 )
 from sbi_active.inference.beliefs.priors import require_support
 from sbi_active.inference.declared.settings import RefinementOptions
+from sbi_active.inference.emulation.refining import refine
 from sbi_active.inference.engine.learned import LearnedBelief
-from sbi_active.inference.refinement.refining import refine
 from sbi_active.inference.rounds.condition import action_rows, outcome_rows
 from sbi_active.inference.rounds.rows import Observation, UnexplainedOutcomeError
 from sbi_active.messages import warn

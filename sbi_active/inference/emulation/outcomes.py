@@ -29,15 +29,15 @@ References:
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import expit, log_expit
 
 from sbi_active.arrays import Array
-from sbi_active.inference.regression.regions import Basis, Region
+from sbi_active.inference.emulation.solving import Region
+from sbi_active.inference.engine.surface import features
 
 
 @dataclass(frozen=True)
@@ -45,9 +45,9 @@ class TrialOutcome:
     r"""Probability in one region that a trial's outcome is what it was.
 
     Attributes:
-        region: Region where it holds.
-        trial: Index of the trial.
-        basis: f.
+        region: Region that gives the coordinates.
+        reach: Distance that is their unit.
+        degree: Degree of f, all products of coordinates.
         coefficient: Shape (p,).
         slip: :math:`\epsilon`, which no regression falls below.
         blur: Share of pairs at the same parameters that the regression expects to
@@ -56,8 +56,8 @@ class TrialOutcome:
     """
 
     region: Region
-    trial: int
-    basis: Basis
+    reach: float
+    degree: int
     coefficient: Array
     slip: float
     blur: float = 0.0
@@ -65,7 +65,6 @@ class TrialOutcome:
     @staticmethod
     def fit(
         region: Region,
-        trial: int,
         z: Array,
         agrees: NDArray[np.bool_],
         pairs: NDArray[np.bool_],
@@ -79,8 +78,7 @@ class TrialOutcome:
         """Fit the regression with the largest evidence.
 
         Args:
-            region: Gives the coordinates.
-            trial: Index of the trial.
+            region: Region that gives the coordinates.
             z: Coordinates of simulations, shape (n, d).
             agrees: Whether their outcome is what was observed, shape (n,).
             pairs: Pairs of simulations at the same parameters, shape (r, 2).
@@ -92,27 +90,26 @@ class TrialOutcome:
             rows_a_feature: Number of rows a feature at least.
             surprise: Probability below which an outcome is a slip.
         """
-        u, n = region.scaled(z), len(z)
+        reach = max(float(region.distance(z).max(initial=0.0)), 1e-300)
+        u, n = region.scaled(z) / reach, len(z)
         degrees = degrees if 0 < agrees.sum() < n else (0,)
-        best, evidence = (Basis.polynomial(0, u.shape[1]), np.zeros(1)), -np.inf
+        best, evidence, likeliest = 0, -np.inf, np.zeros(1)
         for degree in degrees:
-            basis = Basis.polynomial(degree, u.shape[1])
-            features = basis(u)
-            if degree > 1 and n < rows_a_feature * features.shape[1]:
+            rows = features(u, degree)
+            if degree > 1 and n < rows_a_feature * rows.shape[1]:
                 break
-            coefficient = np.zeros(features.shape[1])
+            coefficient = np.zeros(rows.shape[1])
             for deviation in deviations if degree > 0 else (intercept,):
-                scale = np.full(features.shape[1], deviation)
+                scale = np.full(rows.shape[1], deviation)
                 scale[0] = max(deviation, intercept)
-                coefficient, value = _laplace(features, agrees, scale, coefficient)
+                coefficient, value = _laplace(rows, agrees, scale, coefficient)
                 if value > evidence:
-                    best, evidence = (basis, coefficient), value
-        basis, coefficient = best
-        probability = expit(basis(u) @ coefficient)
+                    best, evidence, likeliest = degree, value, coefficient
+        probability = expit(features(u, best) @ likeliest)
         actual = np.where(agrees, probability, 1 - probability)
         if degrees == (0,):  # one kind only: the rule of succession
             slip = 1 / (n + 2)
-            coefficient = np.full(1, 60.0 if agrees.all() else -60.0)
+            likeliest = np.full(1, 60.0 if agrees.all() else -60.0)
         else:
             slip = (1 + (actual < surprise).sum()) / (n + 2)
         expected = float((2 * probability * (1 - probability)).mean())
@@ -120,41 +117,19 @@ class TrialOutcome:
         differ = ((pairs[:, 0] != pairs[:, 1]).sum() + 0.5) / num
         chance = 3 * np.sqrt(differ * (1 - differ) / num)
         blur = max(expected - float(differ) - float(chance), 0.0)
-        return TrialOutcome(region, trial, basis, coefficient, float(slip), blur)
+        return TrialOutcome(region, reach, best, likeliest, float(slip), blur)
 
     def log_prob(self, z: Array) -> Array:
         """Return the log probability, (n, d) -> (n,)."""
-        logit = self.basis(self.region.scaled(z)) @ self.coefficient
+        rows = features(self.region.scaled(z) / self.reach, self.degree)
+        logit = rows @ self.coefficient
         return np.logaddexp(
             np.log(self.slip), np.log1p(-2 * self.slip) + log_expit(logit)
         )
 
 
-def outcomes_of(
-    region: Region,
-    z: Array,
-    agrees: NDArray[np.bool_],
-    repeated: NDArray[np.bool_],
-    trials: Sequence[int],
-) -> tuple[TrialOutcome, ...]:
-    """Return the regressions of trials in a region.
-
-    Simulations z (n, d), whether their outcomes are what was observed (n, t), and the
-    same of simulations that were repeated and of their repetitions, (r, 2, t).
-    """
-    known: dict[bytes, TrialOutcome] = {}  # with hard edges, many trials agree
-    outcomes = []
-    for k in trials:
-        pairs = repeated[:, :, k]
-        key = agrees[:, k].tobytes() + pairs.tobytes()
-        if key not in known:
-            known[key] = TrialOutcome.fit(region, k, z, agrees[:, k], pairs)
-        outcomes.append(replace(known[key], trial=k))
-    return tuple(outcomes)
-
-
 def _laplace(
-    features: Array,
+    rows: Array,
     agrees: NDArray[np.bool_],
     scale: Array,
     start: Array,
@@ -173,15 +148,15 @@ def _laplace(
     prior = 1 / scale**2
 
     def objective(beta: Array) -> float:
-        fit = log_expit(sign * (features @ beta)).sum()
+        fit = log_expit(sign * (rows @ beta)).sum()
         return float(fit - 0.5 * (prior * beta**2).sum())
 
     beta, value = start, objective(start)
     for _ in range(num_steps):
-        probability = expit(features @ beta)
-        gradient = features.T @ (agrees - probability) - prior * beta
+        probability = expit(rows @ beta)
+        gradient = rows.T @ (agrees - probability) - prior * beta
         weight = probability * (1 - probability)
-        hessian = (features.T * weight) @ features + np.diag(prior)
+        hessian = (rows.T * weight) @ rows + np.diag(prior)
         step = np.linalg.solve(hessian, gradient)
         gain, length = float(gradient @ step), 1.0
         if gain < 1e-6:

@@ -26,10 +26,16 @@ from sbi_active.inference.declared.refining import (
     refine_declared,
 )
 from sbi_active.inference.declared.settings import RefinementOptions
+from sbi_active.inference.emulation.emulation import Emulation
+from sbi_active.inference.emulation.pool import EmulatedTrial, Pool, noise_sds
+from sbi_active.inference.emulation.regression import fewest_rows
+from sbi_active.inference.emulation.stages import EmulationSettings
+from sbi_active.inference.emulation.summaries import fitted_summaries
 from sbi_active.inference.engine.learned import LearnedBelief
-from sbi_active.inference.refinement.regional import Regions
-from sbi_active.inference.regression.histories import HistoryRecord
+from sbi_active.inference.rounds.rows import warn_missing
+from sbi_active.inference.sampling.coordinates import PriorCoordinates
 from sbi_active.seeding import derive_seed
+from sbi_active.simulation.outcomes import Simulations
 from sbi_active.support import parameter_dim
 from sbi_active.threads import single_thread
 
@@ -41,7 +47,7 @@ def refine(
     x: Tensor,
     *,
     start: Distribution | Sequence[Distribution] | None = None,
-    past: HistoryRecord | DeclaredRecord | None = None,
+    past: Simulations | DeclaredRecord | None = None,
     settings: RefinementOptions | None = None,
     seed: int,
 ) -> LearnedBelief | SimulatedBelief | EnumeratedBelief:
@@ -51,11 +57,10 @@ def refine(
     likelihood itself, and the posterior is sampled with that (:func:`.infer`).
 
     Of any other simulator it is learned, stage by stage, over the whole prior and then
-    in ellipsoids around what is still plausible: simulate every executed action at each
-    parameter set, regress the outcomes on the parameters (:mod:`.surrogate`), sample
-    prior times surrogate likelihood without simulations
-    (:func:`.learned_fit`), and put new ellipsoids around the sample. It ends
-    when the residuals are pure noise and a stage changes nothing, or when the budget is
+    where it is still plausible: simulate every executed action, regress the outcomes on
+    the parameters (:mod:`.regression`), sample prior times learned likelihood without
+    simulations (:func:`.learned_fit`), and simulate where the sample lies. It ends when
+    the residuals are pure noise and a stage changes nothing, or when the budget is
     spent.
 
     A trial without a measurement counts by the probability of having none, one that was
@@ -70,8 +75,7 @@ def refine(
         start: Distributions to look at first, for example a chained belief and the
             belief before the last trial. It adds simulations and no weight, so it
             cannot bias.
-        past: ``belief.histories`` of an earlier call whose trials are the first of
-            these: what still lies in a region is simulated at the new actions only.
+        past: ``belief.histories`` of an earlier call for the same simulator.
         settings: Budget; None is ``RefinementOptions()``.
         seed: Seed of everything random here.
 
@@ -112,7 +116,7 @@ def refine(
         belief = refine_declared(problem, past)
         if belief is not None:
             return belief
-        known = past if isinstance(past, HistoryRecord) else None
+        known = past if isinstance(past, Simulations) else None
         try:
             return _learned(problem, known)
         except RuntimeError as error:
@@ -126,29 +130,55 @@ def refine(
 
 
 def _learned(
-    problem: Problem, past: HistoryRecord | None, *, max_inflations: int = 3
+    problem: Problem, past: Simulations | None, *, max_inflations: int = 3
 ) -> LearnedBelief:
     """Return the belief of a regression, of as wide a noise as the trials scatter.
 
     The noise is inflated at most ``max_inflations`` times.
     """
-    regions = Regions(problem, past=past)
-    belief, first = regions.run(), regions.contradiction()
-    if first is None:
-        return belief
-    histories, sds = belief.histories, regions.histories.noise_sds
-    now, inflation = first, 1.0
-    for number in range(max_inflations):
-        inflation *= now.inflation
-        further_noise = np.sqrt(max(inflation**2 - 1, 0.0)) * sds
-        again = replace(problem, seed=derive_seed(problem.seed, "inflated", number))
-        wider = Regions(again, further_noise=further_noise)
-        belief, further = wider.run(), wider.contradiction()
-        if further is None:
+    settings, seed = problem.settings, problem.seed
+    rng = np.random.default_rng(derive_seed(seed, "refine"))
+    coordinates = PriorCoordinates(problem.prior, rng)
+    least = 2 * fewest_rows(coordinates.dim)
+    require(
+        settings.num_histories >= least,
+        f"at least {least} histories for {coordinates.dim} parameters",
+        settings.num_histories,
+        "raise num_histories",
+    )
+    pool = Pool(problem.simulator, [], settings.workers, past)
+    budget = settings.num_histories * len(problem.action.unique(dim=0)) - len(pool)
+    pairs = zip(problem.action, problem.x, strict=True)
+    trials = [EmulatedTrial(action, x) for action, x in pairs]
+    hints = coordinates.drawn_from(problem.hints, 1_000, seed=seed)
+    near = np.concatenate([np.zeros((0, coordinates.dim)), *hints])
+    inflation, first, sds = 1.0, None, np.zeros(1)
+    for number in range(max_inflations + 1):
+        emulation = Emulation(
+            *(problem.prior, coordinates, pool, trials),
+            *(fitted_summaries(None, problem.x), settings, EmulationSettings()),
+            budget=max(budget, 0),
+            near=near,
+            seed=derive_seed(seed, "inflated", number) if number else seed,
+        )
+        belief, now = emulation.run(), emulation.contradiction()
+        if now is None:
             break
-        now = further
-    belief.diagnostics = replace(first, inflation=inflation).noted(belief.diagnostics)
-    belief.histories = histories  # those without the further noise
+        if first is None:
+            first, sds = now, noise_sds(pool, trials)
+        inflation *= now.inflation
+        further = np.sqrt(max(inflation**2 - 1, 0.0)) * sds
+        trials = [
+            replace(trial, further_noise=sd)
+            for trial, sd in zip(trials, further, strict=True)
+        ]
+        near = emulation.stages[-1].draws
+    if first is not None:
+        noted = replace(first, inflation=inflation).noted(belief.diagnostics)
+        belief.diagnostics = noted
+    belief.diagnostics = belief.diagnostics.extended(num_simulations=pool.num_drawn)
+    belief.histories = pool.rows
+    warn_missing(pool.num_missing, pool.num_drawn, "their rows")
     return belief
 
 

@@ -182,7 +182,7 @@ def test_a_lack_of_memory_is_said(monkeypatch):
     def lacking(*_):
         raise RuntimeError("DefaultCPUAllocator: can't allocate memory: you tried")
 
-    monkeypatch.setattr("sbi_active.inference.refinement.refining._learned", lacking)
+    monkeypatch.setattr("sbi_active.inference.emulation.refining._learned", lacking)
     one = torch.ones(1, 1)
     with pytest.raises(MemoryError, match="belief of 2 parameters; got none left"):
         refine(numerical().__call__, BOX, one, one, seed=0)

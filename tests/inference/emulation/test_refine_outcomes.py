@@ -102,7 +102,6 @@ def test_close_to_the_exact_posterior(name: str, all_invalid: bool):
     assert ignoring.mean() > 0.2
     if all_invalid:
         assert ignoring.min() > 0.4
-        assert all(run[2].histories.x.shape[1] == 4 for run in runs)
 
 
 def test_numbers_that_were_not_observed_are_left_out():
@@ -143,7 +142,7 @@ def test_an_edge_that_the_regression_cannot_follow_is_flagged():
     assert "followed coarsely" in " ".join(diagnostics.warnings)
 
 
-def test_lost_rows_cost_their_histories_and_nothing_else():
+def test_lost_rows_cost_nothing_else():
     world = WORLDS["edge"]
 
     def faulty(theta: Tensor, action: Tensor) -> Tensor:

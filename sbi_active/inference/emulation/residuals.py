@@ -57,14 +57,23 @@ class ResidualCovariance:
         deviation: Deviation of the residuals, shape (q,).
         blocks: Outcomes of each trial, and the inverse Cholesky factor of their
             correlation.
+        freedom: Degrees of freedom of the residuals.
+        freedoms: Those of the density of each trial's numbers.
         precision: Factor that makes the inverse of the sample covariance unbiased.
         log_volume: log det L.
     """
 
     deviation: Array
     blocks: tuple[tuple[NDArray[np.intp], Array], ...]
+    freedom: int
+    freedoms: tuple[float, ...]
     precision: float
     log_volume: float
+
+    @property
+    def maps(self) -> list[tuple[NDArray[np.intp], Array]]:
+        """Numbers of each trial, and the map that whitens them."""
+        return [(own, (inv / self.deviation[own]).T) for own, inv in self.blocks]
 
     @staticmethod
     def of(
@@ -95,10 +104,13 @@ class ResidualCovariance:
             (invert,) = get_lapack_funcs(("trtri",), (factor,))
             log_volume += float(np.log(np.diag(factor)).sum())
             blocks.append((members, invert(factor, lower=1)[0]))
-        size = int(np.bincount(trial, minlength=1).max())
-        free = 1 + (size - 1) * (1 - shrunk) ** 2
-        precision = max((freedom - free - 1) / freedom, 0.2) if q else 1.0
-        return ResidualCovariance(deviation, tuple(blocks), precision, log_volume)
+        # Correlations that are shrunk are known the better.
+        free = [1 + (len(r) - 1) * (1 - shrunk) ** 2 for r in rows]
+        precision = max((freedom - max(free) - 1) / freedom, 0.2)
+        freedoms = tuple(max(freedom - n + 1, 3.0) for n in free)
+        return ResidualCovariance(
+            deviation, tuple(blocks), freedom, freedoms, precision, log_volume
+        )
 
     def whiten(self, rows: Array) -> Array:
         r"""Return :math:`L^{-1}` times each row, shape (n, q)."""

@@ -16,18 +16,18 @@ from collections.abc import Sequence
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy.special import logsumexp
 from torch import Tensor
 
 from sbi_active.arrays import Array
-from sbi_active.inference.emulation.likelihood import (
-    correlation_root,
-    declared_process,
-    learned_processes,
-    mixture_gain,
-)
+from sbi_active.inference.emulation.emulator import interpolated
 from sbi_active.inference.emulation.pool import Pool
-from sbi_active.inference.emulation.processes import nearest
-from sbi_active.inference.emulation.summaries import Summary, is_short
+from sbi_active.inference.emulation.solving import around
+from sbi_active.inference.emulation.summaries import (
+    Summary,
+    is_short,
+    learned_statistic,
+)
 from sbi_active.inference.sampling.coordinates import PriorCoordinates
 from sbi_active.inference.sampling.gaussian_process import GaussianProcess
 from sbi_active.seeding import derive_seed
@@ -70,8 +70,9 @@ def candidate_gains(
     """
     rows = pool.rows
     z, action = coordinates.to_z(rows.theta), rows.action.double().numpy()
-    near, region = nearest(z, np.ones(len(z), dtype=bool), reference, most_rows)
-    near = np.sort(near)
+    region = around(reference)
+    near = np.sort(np.argsort(region.distance(z), kind="stable")[:most_rows])
+    region = region.sized(z[near])
     rng = np.random.default_rng(derive_seed(seed, "outcomes"))
     draws = reference[rng.integers(len(reference), size=num_outer + num_inner)]
     draws, z, action = region.scaled(draws), z[near], action[near]
@@ -101,7 +102,9 @@ def candidate_gains(
             at = np.concatenate([draws, tiled], 1)
             parts = [process.predict(at) for process in processes]
             mean, variance = (np.concatenate(p, 1) for p in zip(*parts, strict=True))
-            gains[a, k] = mixture_gain(mean, variance, roots[a], normal, num_outer)
+            inverse = np.linalg.inv(roots[a])
+            spread = 1 + variance @ (inverse**2).T
+            gains[a, k] = mixture_gain(mean @ inverse.T, spread, normal)
     return gains * valid[:, None, None], valid
 
 
@@ -122,7 +125,7 @@ def _learned(
     Actions share the noise of ``own_rows`` rows beside those of their own.
     """
     if noise is not None:
-        processes = (declared_process(inputs, numbers, ("rough",)),)
+        processes = (interpolated(inputs, numbers, ("rough",)),)
         zeros = torch.zeros(max(400, 4 * numbers.shape[1]), *x_shape).double()
         seeds = torch.from_numpy(rng.integers(2**62, size=len(zeros)))
         sampled = noise.sample(zeros, seeds).reshape(len(zeros), -1).numpy()
@@ -133,9 +136,54 @@ def _learned(
     if not is_short(numbers.shape[1], dim) and inputs.shape[1] > dim:
         crossed = [numbers * inputs[:, [j]] for j in range(dim, inputs.shape[1])]
         features = np.concatenate([numbers, *crossed, inputs[:, dim:]], 1)
-    _, processes, left_out = learned_processes(inputs, features, z, seed=seed)
+    _, own = learned_statistic(features, z, seed=derive_seed(seed, "folds"))
+    processes = tuple(
+        GaussianProcess.fit(inputs, column[:, None], noise="learned")
+        for column in own.T
+    )
+    left_out = np.concatenate([process.left_out for process in processes], 1)
     common = np.concatenate([p.noise_sd for p in processes]) ** 2
     total = own_rows * common + same.T.astype(float) @ left_out**2
     sd = np.sqrt(total / (own_rows + same.sum(0))[:, None])
     root = correlation_root(left_out)
     return processes, [s[:, None] * root for s in sd]
+
+
+def correlation_root(residual: Array, shrinkage: float = 10.0) -> Array:
+    """Return the Cholesky factor of the correlation of residuals (n, q), shrunk.
+
+    Args:
+        residual: Residuals.
+        shrinkage: Number of rows that independence counts for.
+    """
+    n, q = residual.shape
+    unit = residual / np.maximum(np.sqrt((residual**2).mean(0)), 1e-30)
+    correlation = (unit.T @ unit + shrinkage * np.eye(q)) / (n + shrinkage)
+    return np.linalg.cholesky(correlation)
+
+
+def mixture_gain(mean: Array, spread: Array, normal: Array) -> Array:
+    r"""Return contributions to the information of the first parameters, (k,).
+
+    .. math::
+        I = \mathrm E\left[\log p(x_i | \theta_i) - \log \frac{1}{M + 1}
+        \sum_{j = 0}^M p(x_i | \theta_j)\right], \qquad \theta_0 = \theta_i,
+
+    which is at most log(M + 1) (Foster et al., AISTATS 2020).
+
+    Args:
+        mean: Mean outcomes at the parameters in units of the noise, shape (m, q).
+        spread: Variance of these with that of the noise, shape (m, q) or (m, 1).
+        normal: Standard normal numbers of the first parameters, shape (k, q).
+    """
+    num_outer = len(normal)
+    # Where simulations are few is no property of the outcome: one variance for all.
+    v = spread.mean(0) + 0 * mean
+    x = mean[:num_outer] + np.sqrt(v[:num_outer]) * normal
+    own = -0.5 * (normal**2 + np.log(v[:num_outer])).sum(1)
+    log_volume = 0.5 * np.log(v).sum(1)
+    # (x - m)^2 / v summed over numbers, as products of matrices
+    square = (x**2) @ (1 / v).T - 2 * x @ (mean / v).T + ((mean**2) / v).sum(1)
+    every = -0.5 * square - log_volume
+    keep = np.concatenate([every[:, num_outer:], own[:, None]], 1)
+    return own - (logsumexp(keep, 1) - np.log(keep.shape[1]))
