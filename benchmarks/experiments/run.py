@@ -59,8 +59,6 @@ class Reality:
 
     Attributes:
         problem: What the loop is given.
-        machine: Name of the machine.
-        true: Names of the effects that are there.
         right: Names that are right.
         observe: Function from an action and the place of a trial to what is measured.
         actions: Permitted actions.
@@ -69,8 +67,6 @@ class Reality:
     """
 
     problem: Problem
-    machine: str
-    true: tuple[str, ...]
     right: frozenset[str]
     observe: Callable[[Tensor, int], Tensor]
     actions: DiscreteActions
@@ -126,9 +122,8 @@ def _beside_misfit(number: int, kind: Any) -> Made:
         found = replace(longer, action=actions, discrepancy=what)
         return found.measured(torch.tensor([k]))[0]
 
-    own = {"machine": truth.machine.name, "true": truth.names, "right": right}
-    own |= {"problem": case.problem, "observe": observe}
-    own |= {"index": int(truth.fitted.max()) + 1}
+    index = int(truth.fitted.max()) + 1
+    own = {"problem": case.problem, "right": right, "observe": observe, "index": index}
     return own, truth.machine.draw_actions, truth.action
 
 
@@ -142,10 +137,9 @@ def _in_world_b(number: int, kind: str) -> Made:
         return truth.observe(action[None].float(), torch.tensor([k]))[0]
 
     right = frozenset().union(*[world.equivalent(n) for n in truth.names])
-    own = {"machine": "B", "true": truth.names, "right": right, "observe": observe}
-    own |= {"problem": case.problem, "index": len(case.problem.trials)}
-    own |= {"size": truth.non_centrality}
-    return own, lambda num: world.actions.sample((num,)), truth.action
+    index, size = len(case.problem.trials), truth.non_centrality
+    own = {"problem": case.problem, "right": right, "observe": observe, "index": index}
+    return own | {"size": size}, lambda num: world.actions.sample((num,)), truth.action
 
 
 def _long_enough(truth: Truth, k: int) -> Truth:
@@ -238,24 +232,16 @@ def verdict_of(reality: Reality, number: int, design: str) -> Report:
 def row_of(number: int, kind: Kind, design: str, reach: float) -> Row:
     """Return the row of one case, design and range of permitted actions."""
     reality = Reality.of(number, kind, reach)
-    row = {"machine": reality.machine, "true": [*reality.true], "size": reality.size}
-    row |= {"right": sorted(reality.right) if kind in ("E", "B") else []}
+    right = sorted(reality.right) if kind in ("E", "B") else []
     start = time.process_time()
     report = verdict_of(reality, number, design)
     tested = [
-        {
-            "action": [round(v, 4) for v in trial.registered.action.tolist()],
-            "purpose": trial.registered.purpose,
-            "before": trial.registered.verdict,
-            "effects": [*trial.registered.effects],
-            "after": trial.after,
-            "distance": round(trial.distance, 3),
-            "limit": round(trial.registered.limit, 3),
-            "held": bool(trial.held),
-        }
+        {"before": trial.registered.verdict, "held": bool(trial.held)}
         for trial in report.tested
     ]
-    return row | {
+    return {
+        "size": reality.size,
+        "right": right,
         "verdict": report.verdict,
         "named": [*named(report)],
         "trials": len(tested) if design == "chosen" else NUM_TRIALS,

@@ -119,6 +119,8 @@ class Evidence:
         best_chi_square: Smallest whitened residual sum of squares among the draws.
         best: Best fit of theta and phi, (dim,), of a model that misses, whose draws are
             wide; or None.
+        narrow: Draws of its posterior beside the sensor's error alone, which densities
+            of trials go with, if it misses; or None.
     """
 
     key: ModelKey
@@ -130,6 +132,7 @@ class Evidence:
     draws: Array
     best_chi_square: float
     best: Array | None = None
+    narrow: Array | None = None
 
     @property
     def name(self) -> str:

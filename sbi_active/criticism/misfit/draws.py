@@ -47,7 +47,8 @@ def posterior(found: Verdict, models: RivalSet, key: ModelKey) -> Fit:
     u = model.draws(model.u, found.shown(model.key), NUM_DRAWS, rng)
     u = np.concatenate([model.u[None], u])
     best, *draws = c.to_z(u)[:, : c.num_own]
-    own = replace(fit.evidence, draws=np.array(draws), best=best)
+    narrow, draws = fit.evidence.draws, np.array(draws)
+    own = replace(fit.evidence, draws=draws, best=best, narrow=narrow)
     return replace(fit, evidence=own)
 
 

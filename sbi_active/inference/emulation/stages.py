@@ -111,7 +111,7 @@ class Stage:
     Attributes:
         learned: The learned likelihood.
         fit: Its posterior.
-        belief: The same with a share of the prior.
+        belief: Belief with a share of the prior.
         draws: Equally weighted particles, shape (n, d).
         errors: Expected divergence in nats, as the simulations are finite in number, by
             part of the likelihood.

@@ -74,6 +74,7 @@ class ASBI(ActionRounds, NPE_C):
         ICML 2019, arXiv:1905.07488.
 
     Example:
+        >>> import torch
         >>> from sbi.utils import BoxUniform
         >>> from sbi_active import MixtureDensity
         >>> _ = torch.manual_seed(0)

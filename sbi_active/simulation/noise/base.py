@@ -256,7 +256,8 @@ class ScaleNoise(NoiseModel):
 
     def _by_row(self, rows: Tensor, shape: torch.Size) -> Tensor:
         """Return standard deviations among parameters (n, p), for (n, *x_shape)."""
-        return rows[:, : self._num_sd].reshape(len(rows), *[1] * (len(shape) - 2), -1)
+        sd = rows[:, : self._num_sd]
+        return sd.reshape(len(rows), *[1] * (len(shape) - 2), sd.shape[1])
 
     def _by_channel(self, terms: Tensor) -> Tensor:
         """Return sums over all but the channels, (n, *x_shape) -> (n, num_sd)."""

@@ -107,11 +107,6 @@ def test_trials_that_agree_leave_the_noise_as_it_is(simulator):
 
 
 @pytest.mark.filterwarnings("ignore")
-@pytest.mark.xfail(
-    reason="beliefs of learned likelihoods are not checked against the trials: "
-    "one engine for all potentials",
-    strict=True,
-)
 def test_products_of_learned_likelihoods_do_not_collapse():
     trials = [(1.0, -1.0), (1.0, 2.0), (3.0, 1.6)]
     c = after(trials, method="nlhi")
