@@ -86,18 +86,6 @@ class PriorCoordinates:
         inside = within_support(self.prior, torch.nan_to_num(theta))
         return (finite & inside).numpy()
 
-    def pulled_inside(self, center: Array, z: Array, rng: np.random.Generator) -> Array:
-        """Return z (n, d), drawn towards a center where bounded axes would be left.
-
-        The place on the way is uniform in volume up to the bound.
-        """
-        step = z - center
-        with np.errstate(divide="ignore"):
-            reach = (1 - np.sign(step) * center) / np.abs(step)
-        limit = reach[:, self.bounded].min(1, initial=np.inf)[:, None]
-        place = limit * rng.random((len(z), 1)) ** (1 / self.dim)
-        return np.where(limit < 1, center + place * step, z)
-
     def log_prior(self, z: Array) -> Array:
         """Return the log density of z under the prior, shape (n,)."""
         log_prior = np.full(len(z), -np.inf)
