@@ -179,7 +179,7 @@ def _coverage(groups: Mapping[str, list[Row]]) -> list[str]:
     lines = []
     for title, rows in parts.items():
         for what in ("theta", "phi"):
-            cells = [r[f"{what}_covered"] for r in rows if r[f"{what}_covered"]]
+            cells = [c for r in rows if (c := r.get(f"{what}_covered"))]
             pairs = [tuple(map(int, cell.split("/"))) for cell in cells]
             hits = [i < k for k, n in pairs for i in range(n)]
             lines.append(f"90 % intervals of {what} {title}: {rate(hits)}")
