@@ -177,8 +177,10 @@ def _parts(thing: Any) -> Any:
 
 def _class(name: str) -> Any:
     """Return the class of a name, of a trusted module that defines it; else None."""
-    module, found = name.partition(":")[0], None
-    if module.startswith(TRUSTED) and not module.endswith("__main__"):
+    module, _, qualname = name.partition(":")
+    # Without a colon, resolve_name imports whatever it can, piece by piece.
+    is_plain, found = bool(qualname) and "__main__" not in name, None
+    if is_plain and module.startswith(TRUSTED):
         with suppress(AttributeError, ValueError):  # as of a class within a function
             found = pkgutil.resolve_name(name)
     return found if getattr(found, "__module__", None) == module else None

@@ -11,12 +11,15 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy.stats import binom, chi2, kurtosis
+from scipy.stats import binom, chi2, kurtosis, skew
 
 from sbi_active.arrays import Array
 from sbi_active.inference.beliefs.diagnostics import Diagnostics
 from sbi_active.inference.declared.diagnosing import Doubt, judged
-from sbi_active.inference.emulation.emulator import EmulatedLikelihood
+from sbi_active.inference.emulation.emulator import (
+    EmulatedLikelihood,
+    Interpolation,
+)
 from sbi_active.inference.emulation.pool import TrialRows
 from sbi_active.inference.emulation.regression import Regression, is_misfit
 from sbi_active.inference.emulation.stages import EmulationSettings, Stage
@@ -42,6 +45,38 @@ def noise_tails(
         return 0.0, False
     margin = 3.5 * np.sqrt(24 / values.size)
     return float(kurtosis(values)), bool(kurtosis(values) < light - margin)
+
+
+def shape_of_noise(
+    regressions: Sequence[Regression], *, sure: float = 3.5, matters: float = 0.5
+) -> float:
+    r"""Return how far residuals are from normal ones, above 1 where that matters.
+
+    It is the largest of their skewness and their excess kurtosis, of numbers that are
+    normal with standard errors :math:`\sqrt{6 / n}` and :math:`\sqrt{24 / n}`, over
+    what chance makes of it, or what moves a belief.
+
+    Args:
+        regressions: Regressions that take their noise for normal.
+        sure: Standard errors that are no chance.
+        matters: Skewness, or half of an excess kurtosis, that moves a belief: a t with
+            eight degrees of freedom has a kurtosis of 1.5.
+    """
+    each = [0.0]
+    for fit in regressions:
+        values = fit.standardized[:, fit.standardized.var(0) > 1e-6]
+        n = values.size
+        if n >= 20:
+            least = max(matters, sure * np.sqrt(6 / n))
+            each.append(float(np.abs(skew(values.ravel())) / least))
+            each.append(float(np.abs(kurtosis(values.ravel())) / (2 * least)))
+    return max(each)
+
+
+def missed_rows(learned: EmulatedLikelihood) -> float:
+    """Return the largest error of a left-out row of processes, in their deviations."""
+    parts = [part for part in learned.parts if isinstance(part, Interpolation)]
+    return max((part.process.left_out_most for part in parts), default=0.0)
 
 
 def predicted_tails(
@@ -225,7 +260,9 @@ def diagnosed(
     }
     figures: dict[str, Any] = {"num_stages": num, "prior_edge_mass": edge_mass}
     details, explained = {}, last.error
-    if fresh is not None:
+    if fresh is None:
+        doubts |= _of_few(last.learned)
+    else:
         doubts |= _regressed(stages, own, fresh, shape_change, agreement(last, rows))
         share = [1.0] * (len(tails) - 1)
         for k, outcome in last.learned.outcomes.items():
@@ -246,6 +283,31 @@ def diagnosed(
         figures=figures,
         **known,
     )
+
+
+def _of_few(learned: EmulatedLikelihood, *, most: float = 6.0) -> dict[str, Doubt]:
+    """Return what few rows take for granted, which no fresh ones can check.
+
+    Args:
+        learned: Learned likelihood.
+        most: Error of a left-out row, in deviations, beyond which a process does not
+            follow the simulator: of some hundred normal errors the largest is 3.
+    """
+    fits = [part for part in learned.parts if isinstance(part, Regression)]
+    shape, missed = shape_of_noise(fits), missed_rows(learned)
+    excess = max((fit.excess for fit in fits), default=0.0)
+    return {
+        "normal_noise": (shape <= 1, shape),
+        "even_noise": _evenness(fits),
+        "rows_followed": (missed <= most, missed),
+        "no_misfit": (excess <= EmulationSettings().misfit, excess),
+    }
+
+
+def _evenness(fits: Sequence[Regression]) -> Doubt:
+    """Return whether the noise is about the same for all parameters near the belief."""
+    uneven = max((fit.uneven for fit in fits), default=0.0)
+    return uneven <= 1, uneven
 
 
 def agreement(stage: Stage, rows: Sequence[TrialRows]) -> float:
@@ -297,6 +359,7 @@ def _regressed(
     return {
         "confirmed": (fresh.shift <= limit, fresh.shift),
         "gaussian_noise": (not has_edges, tails),
+        "even_noise": _evenness(fits),
         "noise_known": (known <= 1, known),
         "smooth_response": (roughness <= own.rough, roughness),
         "no_misfit": (excess <= own.misfit, ratio),

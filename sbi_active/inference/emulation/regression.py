@@ -81,6 +81,8 @@ class Regression:
         standardized: Residuals near the belief over their deviations, shape (m, q).
         largest: Largest sum of their squares, whitened.
         shape: Another density of the noise, not Gaussian; None where that is none.
+        uneven: Change of the log variance of the residuals by a deviation of a
+            coordinate, in units of what moves a belief, or of chance.
     """
 
     basis: Basis
@@ -94,6 +96,7 @@ class Regression:
     standardized: Array
     largest: float
     shape: NoiseShape | None = None
+    uneven: float = 0.0
 
     def __getstate__(self) -> dict[str, Any]:
         # Residuals have served the diagnostics and would only weigh on a pickle.
@@ -144,12 +147,16 @@ class Regression:
         if np.isfinite(noise).all():
             share = (polynomial.square - noise) / np.maximum(x.var(0), noise)
             roughness = float(share.max(initial=0.0))
-        shape = None
+        shape, even = None, own.residual
+        rows = region.distance(z) <= own.basis.reach
         if shapes is not None:
-            rows = region.distance(z) <= own.basis.reach
             f = own.basis(z[rows])
             rest = x[rows] - f @ own.coefficient
             shape = NoiseShape.fit(f, own.coefficient, rest, observed, trial, shapes)
+        if shape is not None:  # which knows of noise that grows with what it is on
+            mean = f @ shape.coefficient
+            size = ((mean + observed) ** 2 + shape.floor**2) ** (0.5 * shape.power)
+            even = (x[rows] - mean) / size
         covariance, standardized = own.covariance(trial, noise)
         blocks = [
             Block(
@@ -178,6 +185,7 @@ class Regression:
             standardized=standardized,
             largest=float((white**2).sum(1).max() / chi2.ppf(0.9, white.shape[1])),
             shape=shape,
+            uneven=_uneven(z[rows][own.near], even[own.near]),
         )
 
     def residual(self, z: Array, place: int) -> tuple[Array, Array]:
@@ -272,6 +280,32 @@ def fewest_rows(dim: int, *, freedom: int = 20) -> int:
 def is_misfit(excess: float, *, most: float = 1.12) -> bool:
     """Return whether a basis misses something, by residual over noise variance."""
     return excess > most
+
+
+def _uneven(
+    z: Array, residual: Array, *, sure: float = 3.5, matters: float = 0.5
+) -> float:
+    r"""Return how much the variance of residuals changes along the parameters.
+
+    The logarithm of their squares is regressed on the coordinates.
+
+    Args:
+        z: Coordinates of simulations, shape (n, d).
+        residual: Their residuals, shape (n, q).
+        sure: Standard errors of a slope that are no chance.
+        matters: Slope that moves a belief: the noise changes by 28 % over a deviation.
+    """
+    n, d = z.shape
+    varies = residual.std(0) > 0
+    if n < 4 * (d + 1) or not varies.any() or not (z.std(0) > 0).all():
+        return 0.0
+    scaled = residual[:, varies] / residual[:, varies].std(0)
+    y = np.log((scaled**2).mean(1) + 1e-12)
+    f = np.column_stack([np.ones(n), (z - z.mean(0)) / z.std(0)])
+    slope, *_ = np.linalg.lstsq(f, y, rcond=None)
+    rest = ((y - f @ slope) ** 2).sum() / (n - d - 1)
+    error = np.sqrt(rest * np.diag(np.linalg.pinv(f.T @ f)))
+    return float((np.abs(slope) / np.maximum(matters, sure * error))[1:].max())
 
 
 def _excess(

@@ -191,6 +191,14 @@ class GaussianProcess:
         missed = self.precision @ self.values / self.precision.diagonal()[:, None]
         return (missed * self.scale).numpy()
 
+    @property
+    def left_out_most(self) -> float:
+        """Largest error of a left-out row in the deviations that are expected of it."""
+        missed = (
+            self.precision @ self.values / self.precision.diagonal().sqrt()[:, None]
+        )
+        return float((missed.abs() / self.inflation.sqrt()).max())
+
     def predict(self, u: Array) -> tuple[Array, Array]:
         """Return mean and variance without noise at inputs (m, D), both (m, q)."""
         mean, variance = self(torch.from_numpy(u))

@@ -2,6 +2,7 @@
 
 import os
 import pickle
+import sys
 import zlib
 from io import BytesIO
 from types import SimpleNamespace
@@ -113,3 +114,19 @@ def test_fields_that_came_later_have_their_defaults():
     old = Called(codec.made, kind, {"index": 3, "action": None})
     trial = decode(written(old), known={})
     assert (trial.index, trial.status, trial.seconds) == (3, "pending", {})
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "sbi_active.__main__.x",  # without a colon each piece would be imported
+        "sbi_active.__main__:x",
+        "torch.utils.bottleneck.__main__:main",
+        "os:system",
+    ],
+)
+def test_no_name_in_a_file_runs_a_module(name):
+    assert codec._class(name) is None
+    assert not {"sbi_active.__main__", "torch.utils.bottleneck.__main__"} & {
+        *sys.modules
+    }
