@@ -218,7 +218,7 @@ def number_of(text: str, *, is_outcome: bool = False) -> float:
     except ValueError:
         value = math.inf
     is_held = value == 0 or 2.0**-126 <= abs(value) <= 2.0**128 - 2.0**104
-    advice = "write them apart by blanks, with a point as in 1.5 or 2e-3, without a unit"
+    advice = "write them apart by blanks, with a point as in 1.5 or 2e-3, no unit"
     is_right = is_held or is_outcome and math.isnan(value)
     require(is_right, "finite numbers of float32", f"{text!r:.80}", advice)
     return value
