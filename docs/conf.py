@@ -59,7 +59,6 @@ nb_mime_priority_overrides = [("html", "text/plain", 50)]
 # Reference.
 autodoc_typehints = "none"  # signatures have names and defaults; docstrings the rest
 autodoc_member_order = "bysource"
-autodoc_preserve_defaults = True
 napoleon_numpy_docstring = False
 napoleon_use_ivar = True
 add_module_names = False
