@@ -261,7 +261,7 @@ def diagnosed(
     figures: dict[str, Any] = {"num_stages": num, "prior_edge_mass": edge_mass}
     details, explained = {}, last.error
     if fresh is None:
-        doubts |= _of_few(last.learned)
+        doubts |= _of_few(last.learned, own)
     else:
         doubts |= _regressed(stages, own, fresh, shape_change, agreement(last, rows))
         share = [1.0] * (len(tails) - 1)
@@ -285,11 +285,14 @@ def diagnosed(
     )
 
 
-def _of_few(learned: EmulatedLikelihood, *, most: float = 6.0) -> dict[str, Doubt]:
+def _of_few(
+    learned: EmulatedLikelihood, own: EmulationSettings, *, most: float = 6.0
+) -> dict[str, Doubt]:
     """Return what few rows take for granted, which no fresh ones can check.
 
     Args:
         learned: Learned likelihood.
+        own: Settings of the loop.
         most: Error of a left-out row, in deviations, beyond which a process does not
             follow the simulator: of some hundred normal errors the largest is 3.
     """
@@ -300,7 +303,7 @@ def _of_few(learned: EmulatedLikelihood, *, most: float = 6.0) -> dict[str, Doub
         "normal_noise": (shape <= 1, shape),
         "even_noise": _evenness(fits),
         "rows_followed": (missed <= most, missed),
-        "no_misfit": (excess <= EmulationSettings().misfit, excess),
+        "no_misfit": (excess <= own.misfit, excess),
     }
 
 
