@@ -26,6 +26,7 @@ from torch import Tensor, _utils
 
 from sbi_active.inference.sampling.row_cache import RowCache
 from sbi_active.messages import Explained, Message
+from sbi_active.simulation.bank.store import GUARD
 
 #: Packages whose classes are stored by their attributes.
 TRUSTED = (
@@ -157,11 +158,13 @@ def decode(content: bytes | None, *, known: Mapping[str, Any]) -> Any:
         return None
     # What was written shrinks less: a small file that fills memory was crafted.
     limit, reader = LEAST_LIMIT + MOST_SHRUNK * len(content), zlib.decompressobj()
-    torch.serialization.add_safe_globals([*CALLED])
     token = _KNOWN.set(known)
     try:
         plain = BytesIO(reader.decompress(content, limit))
-        return torch.load(plain, weights_only=True)
+        with GUARD:  # other checkpoints of the process may call no more than before
+            allowed = {*CALLED} - {*torch.serialization.get_safe_globals()}
+            with torch.serialization.safe_globals([*allowed]):
+                return torch.load(plain, weights_only=True)
     except Exception as error:  # each library has its own
         text = f"expected what this library stores; got {type(error).__name__}"
         raise ValueError(f"{text}: {error!s:.60}; restore the file") from error

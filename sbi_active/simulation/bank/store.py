@@ -100,7 +100,7 @@ def sensible(path: Path) -> Iterator[None]:
 
 
 #: One thread at a time reads or writes, and none while the process forks.
-_GUARD = threading.RLock()
+GUARD = threading.RLock()
 _STORES: weakref.WeakSet[Store] = weakref.WeakSet()
 
 
@@ -129,7 +129,7 @@ class Store:
         self.folder, self.path, self._what = folder, folder / NAME, what
         self._connection: Any = None
         self._lock: Any = None
-        with _GUARD:
+        with GUARD:
             _STORES.add(self)
         if make and not os.path.lexists(self.path):
             self._make()
@@ -150,7 +150,7 @@ class Store:
             LockedError: If another process holds it for longer than it takes to read.
             OSError: If the disk is full or cannot be read.
         """
-        with _GUARD:
+        with GUARD:
             opens, keeps = self._connection is None, False
             try:
                 if opens:
@@ -175,7 +175,7 @@ class Store:
             LogChangedError: If the series has another length; nothing is written.
             OSError: If the disk is full or cannot be written.
         """
-        with _GUARD:
+        with GUARD:
             self.acquire()
             with self.reading() as connection:
                 is_left = self.seal() == self._left
@@ -201,7 +201,7 @@ class Store:
             LockedError: If another writer, in this process or another, has it.
             OSError: If the folder cannot be written.
         """
-        with _GUARD, sensible(self.folder / LOCK):
+        with GUARD, sensible(self.folder / LOCK):
             if self._lock is not None:
                 return
             lock = _connected(self.folder / LOCK, "rwc", timeout=0.1)
@@ -211,7 +211,7 @@ class Store:
 
     def close(self) -> None:
         """Let others write. The next call opens the file again."""
-        with _GUARD:
+        with GUARD:
             self._drop("_connection", "_lock")
 
     def get(self, kind: str, number: int = 0) -> bytes | None:
@@ -378,7 +378,7 @@ def _digest(name: int, kind: str, number: int, content: bytes) -> bytes:
 
 def _before_fork() -> None:
     """Close connections, which a child must not have, once they are not in use."""
-    _GUARD.acquire()
+    GUARD.acquire()
     for store in _STORES:
         store._drop("_connection")
 
@@ -387,9 +387,9 @@ def _in_child() -> None:
     """Give back what a child has no right to: that of its parent to write."""
     for store in _STORES:
         store._drop("_lock")
-    _GUARD.release()
+    GUARD.release()
 
 
 if hasattr(os, "register_at_fork"):
-    os.register_at_fork(before=_before_fork, after_in_parent=_GUARD.release)
+    os.register_at_fork(before=_before_fork, after_in_parent=GUARD.release)
     os.register_at_fork(after_in_child=_in_child)

@@ -4,6 +4,7 @@ import os
 import pickle
 import sys
 import zlib
+from concurrent.futures import ThreadPoolExecutor
 from io import BytesIO
 from types import SimpleNamespace
 
@@ -130,3 +131,18 @@ def test_no_name_in_a_file_runs_a_module(name):
     assert not {"sbi_active.__main__", "torch.utils.bottleneck.__main__"} & {
         *sys.modules
     }
+
+
+def test_other_checkpoints_may_call_no_more_than_before():
+    with torch.serialization.safe_globals([set]):
+        before = {*torch.serialization.get_safe_globals()}
+        assert decode(encode({1, 2}, known={}), known={}) == {1, 2}
+        assert {*torch.serialization.get_safe_globals()} == before
+    assert codec.made not in before
+
+
+def test_threads_may_read_at_the_same_time():
+    content = encode([{k} for k in range(200)], known={})
+    with ThreadPoolExecutor(8) as pool:
+        found = [*pool.map(lambda _: decode(content, known={}), range(64))]
+    assert found == [[{k} for k in range(200)]] * 64
