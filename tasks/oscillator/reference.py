@@ -14,7 +14,6 @@ import numpy as np
 import torch
 from sbi.utils import BoxUniform
 from torch import Tensor
-from typing_extensions import override
 
 from sbi_active.seeding import forked_generators
 from sbi_active.tasks.oscillator.model import NOISE_SD, PRIOR_HIGH, PRIOR_LOW, mean
@@ -79,7 +78,6 @@ class OscillatorReference(SampledPosterior):
         scale = 0.5 * LOG_2PI + math.log(self.noise_sd)
         return -0.5 * squares / self.noise_sd**2 - OUTCOMES * scale
 
-    @override
     def sample(self, num: int, *, seed: int | None = None) -> Tensor:
         if len(self.x):
             return super().sample(num, seed=seed)
