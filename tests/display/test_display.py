@@ -1,12 +1,12 @@
 """Tables, notebooks and pages that travel, with names that a user chose."""
 
 import re
-from dataclasses import replace
 
 import matplotlib.pyplot
 import pandas as pd
 import pytest
 import torch
+from attrs import evolve
 from sbi.utils import BoxUniform
 
 from sbi_active import (
@@ -72,7 +72,7 @@ def test_any_name_can_be_drawn_and_read(tmp_path):
     )
     prior = BoxUniform(torch.zeros(3), torch.ones(3))
     actions = DiscreteActions(torch.eye(3) + 1, names=NAMES, units=["$"] * 3)
-    options = replace(OPTIONS, network="on demand")
+    options = evolve(OPTIONS, network="on demand")
     c = Campaign(model, prior, actions, seed=0, options=options)
     c.tell([0.5] * 3, trial=c.ask())
     c.update()
@@ -114,7 +114,7 @@ def campaign():
         MODEL.fn, noise=MODEL.noise, parameter_names=["mass", EVIL[:8]]
     )
     actions = DiscreteActions([0.5, 2.0], names=[f"speed {EVIL}"], units=["m/s"])
-    options = replace(OPTIONS, network="on demand")
+    options = evolve(OPTIONS, network="on demand")
     c = Campaign(model, PRIOR, actions, options=options)
     c.ask()
     c.tell(outcome(c.pending.action, 0))

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from functools import cached_property
 from typing import Any
 
 import torch
+from attrs import evolve
 from torch import Tensor
 from torch.distributions import Distribution
 
@@ -308,7 +308,7 @@ class Learner:
     @property
     def _refinement(self) -> RefinementOptions:
         options = self.state.options
-        return replace(options.refinement, workers=options.workers)
+        return evolve(options.refinement, workers=options.workers)
 
     def simulated(self, action: Tensor) -> Tensor:
         """Return actions (..., action_dim) as the simulator gets them."""
