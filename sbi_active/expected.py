@@ -39,7 +39,7 @@ def require(holds: bool, expected: str, got: Any, advice: str) -> None:
         raise ValueError(f"expected {expected}; got {got}; {advice}")
 
 
-def at_least(least: float, advice: str) -> Validator:
+def at_least(least: float, advice: str = "raise it") -> Validator:
     """Return a validator of a setting, or of each of several numbers in a tuple.
 
     None is taken where it is the default.

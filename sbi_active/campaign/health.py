@@ -15,7 +15,13 @@ import torch
 from torch import Tensor
 from torch.distributions import Distribution
 
-from sbi_active.campaign.state import FAR, CampaignState, ModelVersion, Trial
+from sbi_active.campaign.state import (
+    FAR,
+    CampaignState,
+    ModelVersion,
+    Trial,
+    first_numbers,
+)
 from sbi_active.inference.beliefs.belief import UnchangedBelief
 from sbi_active.inference.beliefs.diagnostics import Diagnostics
 
@@ -222,7 +228,8 @@ def in_doubt(
 
 def _doubt(trial: Trial) -> str:
     far, index = trial.outlyingness or 0.0, trial.index
-    where = f"trial {index} at action {_shown(trial.action)}: x = {_shown(trial.x)} "
+    action, x = map(first_numbers, (trial.action, trial.x))
+    where = f"trial {index} at action [{action}]: x = [{x}] "
     if math.isinf(far):
         what = "has numbers that no simulation from the prior has"
     else:
@@ -235,9 +242,3 @@ def _doubt(trial: Trial) -> str:
         f"SA102 {where}{what}{so}; correct or withdraw trial {index}, and criticize "
         "where it is right"
     )
-
-
-def _shown(values: Tensor | None) -> str:
-    numbers = [] if values is None else values.flatten().tolist()
-    shown = ", ".join(f"{v:.6g}" for v in numbers[:6])
-    return f"[{shown}{', ...' if len(numbers) > 6 else ''}]"

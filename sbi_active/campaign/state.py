@@ -93,17 +93,17 @@ class Trial:
     num_missing: int = 0
 
     def __repr__(self) -> str:
-        outcome = "" if self.x is None else f", x [{_first(self.x)}]"
+        outcome = "" if self.x is None else f", x [{first_numbers(self.x)}]"
         gain = self.information_gained
         told = "" if gain is None else f", {gain:.2f} nats"
-        action = _first(self.action)
+        action = first_numbers(self.action)
         return f"Trial({self.index}: action [{action}], {self.status}{outcome}{told})"
 
     def _repr_html_(self) -> str:
         gain, error = map(number, self.expected_gain)
         pairs = [
-            ("action", _first(self.action, self.design and self.design.labels)),
-            ("outcome", _first(self.x) if self.status != "invalid" else ""),
+            ("action", first_numbers(self.action, self.design and self.design.labels)),
+            ("outcome", first_numbers(self.x) if self.status != "invalid" else ""),
             ("chosen for", self.target),
             ("expected to tell", f"{gain} ± {error or '?'} nats" if gain else ""),
             ("told", _with(self.information_gained, "nats")),
@@ -188,7 +188,7 @@ def _with(value: float | None, unit: str = "") -> str:
     return f"{number(value)} {unit}".strip() if value is not None else ""
 
 
-def _first(
+def first_numbers(
     values: Tensor | None, labels: Sequence[str] | None = None, most: int = 6
 ) -> str:
     """Return the first numbers of an action or an outcome, after their labels."""

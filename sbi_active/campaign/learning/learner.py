@@ -112,6 +112,11 @@ class Learner:
         seed = derive_seed(self.state.seed, "index")
         return depends_on_index(self.simulator, self.prior, self.actions, seed=seed)
 
+    @property
+    def infers_anew(self) -> bool:
+        """Whether a belief is that of all trials at once, and not of one more."""
+        return not self.has_networks or self.has_index
+
     def resume(self, belief: Callable[[], Distribution]) -> None:
         """Go on where ``state.processed`` ends.
 
@@ -247,38 +252,36 @@ class Learner:
         self._prepare(index)
         before = self.belief
         with state.stage(index, "update"):
-            belief, *spent = self._updated(trial)
+            belief = self._updated(trial)
             seed = derive_seed(state.seed, "gain", index)
             gained = information_gained(belief, before, seed=seed)
-        self.round = Round(self)
-        state.account(index, *spent)
-        return {"information_gained": gained, "misfit": misfit(belief.diagnostics)}
+        self.round, figures = Round(self), belief.diagnostics
+        state.account(index, figures.num_simulations, figures.num_missing)
+        return {"information_gained": gained, "misfit": misfit(figures)}
 
     def _prepare(self, index: int) -> None:
         """Train the network that the update of a trial uses."""
         refine = self.state.options.refine
-        if not self.has_index and (self.trains_each_round or not refine):
+        if not self.infers_anew and (self.trains_each_round or not refine):
             self.round.trained(index)
 
-    def _updated(self, trial: Trial) -> tuple[Any, int, int]:
-        """Return the belief with one more trial, its simulations and those missing."""
+    def _updated(self, trial: Trial) -> Any:
+        """Return the belief with one more trial."""
         state = self.state
-        if self.has_index:
+        if self.infers_anew:
             earlier = [t for t in state.explained if t.index != trial.index]
-            belief = self._inferred([*earlier, trial], trial.index)
-        else:
-            with forked_generators(state.seed, "update", trial.index):
-                assert trial.x is not None
-                belief = self.inference.update(
-                    trial.x,
-                    action=trial.action,
-                    simulator=self.simulator if state.options.refine else None,
-                    refinement=self._refinement,
-                    seed=derive_seed(state.seed, "refine", trial.index),
-                )
-            note_combinations(belief, self._names, seed=state.seed)
-        figures = belief.diagnostics
-        return belief, figures.num_simulations, figures.num_missing
+            return self._inferred([*earlier, trial], trial.index)
+        with forked_generators(state.seed, "update", trial.index):
+            assert trial.x is not None
+            belief: Any = self.inference.update(
+                trial.x,
+                action=trial.action,
+                simulator=self.simulator if state.options.refine else None,
+                refinement=self._refinement,
+                seed=derive_seed(state.seed, "refine", trial.index),
+            )
+        note_combinations(belief, self._names, seed=state.seed)
+        return belief
 
     def infer(self, trials: Sequence[Trial]) -> float | None:
         """Replace the belief by that of these trials, from scratch.

@@ -31,10 +31,10 @@ class RefinementOptions:
             history of which a row stays lost is left out.
     """
 
-    num_histories: int = field(default=3_000, validator=at_least(200, "raise it"))
-    num_effective: float = field(default=200, validator=at_least(20, "raise it"))
+    num_histories: int = field(default=3_000, validator=at_least(200))
+    num_effective: float = field(default=200, validator=at_least(20))
     defensive: float = field(
         default=1e-5,
-        validator=[at_least(1e-6, "raise it"), at_most(0.5, "use a small share")],
+        validator=[at_least(1e-6), at_most(0.5, "use a small share")],
     )
     workers: Workers = field(default=IN_PROCESS, validator=of_class(Workers))

@@ -42,7 +42,7 @@ class LFIRE:
         tenth.
     """
 
-    num_marginal: int = field(default=500, validator=at_least(10, "raise it"))
+    num_marginal: int = field(default=500, validator=at_least(10))
     #: Parts of the cross-validation.
     num_folds: ClassVar[int] = 3
 

@@ -40,7 +40,7 @@ class MixtureDetails:
             standardizes each number over all rows alone.
     """
 
-    batch_size: int = field(default=200, validator=at_least(1, "raise it"))
+    batch_size: int = field(default=200, validator=at_least(1))
     learning_rate: float = field(default=1.5e-2, validator=positive("use 1e-3"))
     activation: Literal["silu", "relu"] = field(
         default="silu", validator=one_of(*ACTIVATIONS)
@@ -87,11 +87,9 @@ class MixtureDensity:
         torch.Size([3])
     """
 
-    hidden_features: tuple[int, ...] = field(
-        default=(128, 128), validator=at_least(1, "raise it")
-    )
-    num_components: int = field(default=8, validator=at_least(1, "raise it"))
-    num_iterations: int = field(default=160, validator=at_least(1, "raise it"))
+    hidden_features: tuple[int, ...] = field(default=(128, 128), validator=at_least(1))
+    num_components: int = field(default=8, validator=at_least(1))
+    num_iterations: int = field(default=160, validator=at_least(1))
     embedding_net: nn.Module | None = None
     details: MixtureDetails = field(
         default=MixtureDetails(), validator=of_class(MixtureDetails)

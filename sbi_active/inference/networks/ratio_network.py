@@ -25,10 +25,8 @@ class RatioClassifier:
         num_iterations: Steps of stochastic gradient descent, at most.
     """
 
-    hidden_features: tuple[int, ...] = field(
-        default=(64, 64), validator=at_least(1, "raise it")
-    )
-    num_iterations: int = field(default=400, validator=at_least(1, "raise it"))
+    hidden_features: tuple[int, ...] = field(default=(64, 64), validator=at_least(1))
+    num_iterations: int = field(default=400, validator=at_least(1))
     anneal: ClassVar[bool] = False
 
     @property
