@@ -9,23 +9,16 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Sequence
-from typing import Any, Literal
+from typing import Any
 
 import torch
 from torch import Tensor
 from torch.distributions import Distribution
 
-from sbi_active.campaign.state import (
-    FAR,
-    CampaignState,
-    ModelVersion,
-    Trial,
-    first_numbers,
-)
+from sbi_active.campaign.state import FAR, CampaignState, Trial, first_numbers
+from sbi_active.campaign.telling import Health
 from sbi_active.inference.beliefs.belief import UnchangedBelief
 from sbi_active.inference.beliefs.diagnostics import Diagnostics
-
-Health = Literal["ok", "watch", "alarm"]
 
 
 def assess(state: CampaignState, *, alarm: float = 0.05, watch: float = 0.25) -> Health:
@@ -57,39 +50,13 @@ def assess(state: CampaignState, *, alarm: float = 0.05, watch: float = 0.25) ->
         Vovk & Wang, Annals of Statistics 2021 (e-values from p-values); Ville, Etude
         critique de la notion de collectif, 1939.
     """
-    version = state.version
-    trials = [t for t in state.measured if t.version == version.number]
-    return _health(version, trials, alarm, watch)
-
-
-def health_by_trial(state: CampaignState) -> dict[int, Health]:
-    """Return the health when each trial had been used, without those not scored."""
-    scored: dict[int, list[Trial]] = {v.number: [] for v in state.versions}
-    found = {}
-    for index in state.processed:
-        trial = state.trials[index]
-        if trial.is_measured:
-            if trial.version is None:
-                continue
-            scored[trial.version].append(trial)
-        then = [v for v in state.versions if not v.number or index not in v.trials][-1]
-        found[index] = _health(then, scored[then.number])
-    return found
-
-
-def _health(
-    version: ModelVersion,
-    trials: Sequence[Trial],
-    alarm: float = 0.05,
-    watch: float = 0.25,
-) -> Health:
-    """Return the health of a model after trials that it scored, see :func:`assess`."""
+    trials = [t for t in state.measured if t.version == state.version.number]
     bet = largest_bet = 0.0
     for trial in trials:
         if trial.surprise is not None and not is_off(trial.belief_error or 0.0):
             bet += log_e_value(trial.surprise)
             largest_bet = max(largest_bet, bet)
-    misfits = [version.misfit, *(t.misfit for t in trials)]
+    misfits = [state.version.misfit, *(t.misfit for t in trials)]
     known = enumerate((m for m in misfits if m is not None), 1)
     least = min((m * t * (t + 1) for t, m in known), default=math.inf)
     if largest_bet >= math.log(2 / alarm) or least < alarm / 2:

@@ -16,7 +16,7 @@ from torch.distributions import Distribution
 
 from sbi_active import progress
 from sbi_active.campaign.options import CampaignOptions
-from sbi_active.campaign.telling import Facts, Status, facts_in
+from sbi_active.campaign.telling import Facts, Health, Status, facts_in
 from sbi_active.design.design import Design
 from sbi_active.display.notebook import card, facts
 from sbi_active.display.table import number
@@ -64,6 +64,7 @@ class Trial:
         reason: Reason for which it was withdrawn.
         cost: Cost of the executed action, also of a trial that was missing or withdrawn
             since; None while it is pending, and without a cost or a budget.
+        health: Health of the campaign when the trial had been used; None before.
         version: Number of the model that scored the trial.
         seconds: Wall time by stage; it and what follows add up if computed again.
         cpu_seconds: CPU time by stage.
@@ -86,6 +87,7 @@ class Trial:
     summary: str | None = None
     reason: str = ""
     cost: float | None = None
+    health: Health | None = None
     version: int | None = None
     seconds: dict[str, float] = field(default_factory=dict)
     cpu_seconds: dict[str, float] = field(default_factory=dict)
@@ -121,10 +123,7 @@ class Trial:
 
     @property
     def expected_gain(self) -> tuple[float, float]:
-        """The action's expected information gain and its standard error, nats.
-
-        They are NaN for a trial that was not designed.
-        """
+        """Its expected gain and the standard error, nats; NaN if not designed."""
         design = self.design
         if design is None:
             return float("nan"), float("nan")
@@ -174,7 +173,7 @@ class ModelVersion:
 #: Fields of a trial that was not scored.
 UNSCORED: dict[str, Any] = dict.fromkeys(
     ("information_gained", "surprise", "belief_error", "log_score", "misfit")
-    + ("outlyingness", "version")
+    + ("outlyingness", "health", "version")
 )
 
 

@@ -40,7 +40,7 @@ from sbi_active.inference.rounds.rows import Observation, UnexplainedOutcomeErro
 from sbi_active.inference.trainers.base import ActiveInference
 from sbi_active.messages import warn
 from sbi_active.seeding import derive_seed, forked_generators
-from sbi_active.simulation import simulate
+from sbi_active.simulation import Simulations, simulate
 from sbi_active.simulation.workers.store import SimulationBudgetError
 
 
@@ -208,15 +208,15 @@ class Learner:
         seed = derive_seed(self.state.seed, purpose, index)
         with forked_generators(seed, "theta"):
             theta = source.sample(torch.Size([num]))
-        rows = simulate(
-            self.at(index),
-            theta,
-            trial.action.expand(num, -1),
-            seed=derive_seed(seed, "x"),
-            workers=options.workers,
-        )
+        rows = self.outcomes(trial, theta, derive_seed(seed, "x"))
         self.state.account(index, num, rows.counts["missing"])
         return rows.without_missing().x
+
+    def outcomes(self, trial: Trial, theta: Tensor, seed: int) -> Simulations:
+        """Return outcomes of a trial's action at parameters (n, theta_dim)."""
+        action = self.simulated(trial.action).expand(len(theta), -1)
+        how: Any = {"seed": seed, "workers": self.state.options.workers}
+        return simulate(self.at(trial.index), theta, action, **how)
 
     def _examined(self, trial: Trial) -> Trial:
         """Compare a trial that the belief did not lead to with all of the prior."""
