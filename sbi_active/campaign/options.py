@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from numbers import Real
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, Literal
 
 import cloudpickle
@@ -59,11 +58,9 @@ class CampaignDetails:
 _limit = positive("leave a rule at None that is not wanted")
 
 
-def _numbers(limit: float | Sequence[float] | None) -> float | tuple[float, ...] | None:
+def _numbers(limit: float | Iterable[float] | None) -> float | Sequence[float] | None:
     """Return a limit as it is, or several as a tuple of numbers."""
-    if limit is None or isinstance(limit, Real):
-        return limit  # pyright: ignore[reportReturnType]
-    return (*map(float, limit),)  # pyright: ignore[reportArgumentType]
+    return (*map(float, limit),) if isinstance(limit, Iterable) else limit
 
 
 @suggests

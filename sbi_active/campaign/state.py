@@ -18,8 +18,6 @@ from sbi_active import progress
 from sbi_active.campaign.options import CampaignOptions
 from sbi_active.campaign.telling import Facts, Health, Status, facts_in
 from sbi_active.design.design import Design
-from sbi_active.display.notebook import card, facts
-from sbi_active.display.table import number
 from sbi_active.inference.emulation.pool import Batch
 from sbi_active.messages import warn
 from sbi_active.seeding import derive_seed, forked_generators
@@ -101,26 +99,6 @@ class Trial:
         action = first_numbers(self.action)
         return f"Trial({self.index}: action [{action}], {self.status}{outcome}{told})"
 
-    def _repr_html_(self) -> str:
-        gain, error = map(number, self.expected_gain)
-        pairs = [
-            ("action", first_numbers(self.action, self.design and self.design.labels)),
-            ("outcome", first_numbers(self.x) if self.status != "invalid" else ""),
-            ("chosen for", self.target),
-            ("expected to tell", f"{gain} ± {error or '?'} nats" if gain else ""),
-            ("told", _with(self.information_gained, "nats")),
-            ("surprise", _with(self.surprise)),
-            ("misfit after it", _with(self.misfit)),
-            ("beyond all simulations by", _with(self.outlyingness, "of their ranges")),
-            ("simulations", self.num_simulations),
-            ("lost of them", self.num_missing),
-            ("cost", _with(self.cost)),
-            ("time", _with(sum(self.seconds.values()) or None, "s")),
-            ("reason", self.reason),
-        ]
-        shown = [(name, value) for name, value in pairs if value]
-        return card(f"Trial {self.index}: {self.status}", facts(shown))
-
     @property
     def expected_gain(self) -> tuple[float, float]:
         """Its expected gain and the standard error, nats; NaN if not designed."""
@@ -183,17 +161,9 @@ def tensor_of(listed: Any) -> Tensor:
         return torch.from_numpy(np.array(listed, np.float64)).float()
 
 
-def _with(value: float | None, unit: str = "") -> str:
-    return f"{number(value)} {unit}".strip() if value is not None else ""
-
-
-def first_numbers(
-    values: Tensor | None, labels: Sequence[str] | None = None, most: int = 6
-) -> str:
-    """Return the first numbers of an action or an outcome, after their labels."""
+def first_numbers(values: Tensor | None, most: int = 6) -> str:
+    """Return the first numbers of an action or an outcome."""
     numbers = [] if values is None else [f"{v:.4g}" for v in values.flatten().tolist()]
-    if labels and len(labels) == len(numbers):
-        numbers = [f"{a} {v}" for a, v in zip(labels, numbers, strict=True)]
     left = len(numbers) - most
     shown = ", ".join(numbers[:most])
     return f"{shown} and {left} more" if left > 0 else shown
