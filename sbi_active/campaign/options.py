@@ -156,6 +156,9 @@ GROUPS = {"workers": Workers, "details": CampaignDetails}
 class CampaignOptions:
     """Sizes and estimators of a campaign.
 
+    ``attrs.evolve(options, num_samples=500)`` returns a copy with another value, of
+    these and all other options.
+
     Attributes:
         num_simulations: Number of training rows in each round.
         num_samples: Number of simulations of each candidate action for the expected
