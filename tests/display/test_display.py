@@ -17,7 +17,6 @@ from sbi_active import (
     SimulatorModel,
 )
 from sbi_active.campaign.display.page import page as campaign_page
-from sbi_active.campaign.display.page import write_page
 from sbi_active.display import Page, Section, Table
 from sbi_active.display.figures import legible
 from sbi_active.display.notebook import badge, card, facts, items, table
@@ -76,8 +75,9 @@ def test_any_name_can_be_drawn_and_read(tmp_path):
     c = Campaign(model, prior, actions, seed=0, options=options)
     c.tell([0.5] * 3, trial=c.ask())
     c.update()
-    page = write_page(c, tmp_path / "page.html").read_text(encoding="utf-8")
+    page = campaign_page(c)
     assert "\x07" not in page
+    page.encode()
     c.plot().savefig(tmp_path / "plot.svg")
     c.history[0].design.plot().figure.savefig(tmp_path / "design.png")
 

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -156,13 +154,6 @@ def page(campaign: Any, num_draws: int = 4_000) -> str:
     ).html({"course": figure})
     plt.close(figure)
     return made
-
-
-def write_page(campaign: Any, path: str | os.PathLike[str]) -> Path:
-    """Write :func:`page` to a file, and return its path."""
-    path = Path(path)
-    path.write_text(page(campaign), encoding="utf-8")
-    return path
 
 
 def campaign_html(campaign: Any, most: int = 12) -> str:
