@@ -5,11 +5,17 @@ from __future__ import annotations
 import difflib
 import functools
 import inspect
+import operator
 from collections.abc import Callable, Iterable, Sequence
 from numbers import Real
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
+
+if TYPE_CHECKING:
+    from attrs import Attribute
 
 Taking = TypeVar("Taking", bound=Callable[..., Any])
+#: What attrs calls with an instance, the attribute and its value.
+Validator = Callable[[Any, "Attribute[Any]", Any], None]
 
 
 def require(holds: bool, expected: str, got: Any, advice: str) -> None:
@@ -33,63 +39,75 @@ def require(holds: bool, expected: str, got: Any, advice: str) -> None:
         raise ValueError(f"expected {expected}; got {got}; {advice}")
 
 
-def require_least(settings: Any, advice: str, **limits: float) -> None:
-    """Raise if a field of settings is below its limit.
+def at_least(least: float, advice: str = "raise it") -> Validator:
+    """Return a validator of a setting, or of each of several numbers in a tuple.
+
+    None is taken where it is the default.
 
     Args:
-        settings: Dataclass; a field may be None where that is its default, and of
-            several numbers the smallest counts.
+        least: Smallest value.
         advice: Advice on what to do.
-        **limits: Smallest value of each field.
-
-    Raises:
-        ValueError: If one is below, with its name.
     """
-    for name, least in limits.items():
-        value, expected = getattr(settings, name), f"{name} >= {least}"
-        if getattr(type(settings), name) is None:
+    return _compared(operator.ge, f">= {least}", least, advice)
+
+
+def at_most(most: float, advice: str) -> Validator:
+    """Return a validator as :func:`at_least` does, for a largest value."""
+    return _compared(operator.le, f"<= {most}", most, advice)
+
+
+def positive(advice: str) -> Validator:
+    """Return a validator as :func:`at_least` does, for values above zero."""
+    return _compared(operator.gt, "> 0", 0, advice)
+
+
+def _compared(
+    holds: Callable[[Any, Any], bool], bounds: str, limit: float, advice: str
+) -> Validator:
+    def check(settings: Any, attribute: Any, value: Any) -> None:
+        expected = f"{attribute.name} {bounds}"
+        if attribute.default is None:
             expected += " or None"
-            value = least if value is None else value
-        smallest = min(value, default=least) if isinstance(value, tuple) else value
-        is_number = isinstance(smallest, Real)
-        require(
-            is_number and float(smallest) >= least, expected, repr(smallest), advice
-        )
+            if value is None:
+                return
+        for number in value if isinstance(value, tuple) else (value,):
+            is_right = isinstance(number, Real) and holds(float(number), limit)
+            require(is_right, expected, repr(number), advice)
+
+    return check
 
 
-def require_kinds(settings: Any, **kinds: type) -> None:
-    """Raise if a field of settings is of another class.
+def of_class(kind: type) -> Validator:
+    """Return a validator of a setting that is an instance of a class.
 
     Args:
-        settings: Dataclass.
-        **kinds: Class of each field.
-
-    Raises:
-        TypeError: If it has another one, with its name and what to pass.
+        kind: The class.
     """
-    for name, kind in kinds.items():
-        value, expected = getattr(settings, name), kind.__name__
+    advice = "True or False" if kind is bool else f"{kind.__name__}(...)"
+
+    def check(settings: Any, attribute: Any, value: Any) -> None:
         if not isinstance(value, kind):
-            advice = "True or False" if kind is bool else f"{expected}(...)"
             raise TypeError(
-                f"expected {name} of class {expected}; got {value!r}; pass {advice}"
+                f"expected {attribute.name} of class {kind.__name__}; got {value!r}; "
+                f"pass {advice}"
             )
 
+    return check
 
-def require_one_of(settings: Any, **known: Iterable[Any]) -> None:
-    """Raise if a field of settings is none of the values that it may have.
+
+def one_of(*known: Any) -> Validator:
+    """Return a validator of a setting that has one of some values.
 
     Args:
-        settings: Dataclass.
-        **known: Values of each field.
-
-    Raises:
-        ValueError: If it has another value, with its name and those.
+        *known: The values.
     """
-    for name, values in known.items():
-        value, valid = getattr(settings, name), (*values,)
-        expected = f"{name} among {', '.join(map(repr, valid))}"
-        require(value in valid, expected, repr(value), "choose one of these")
+    valid = ", ".join(map(repr, known))
+
+    def check(settings: Any, attribute: Any, value: Any) -> None:
+        expected = f"{attribute.name} among {valid}"
+        require(value in known, expected, repr(value), "choose one of these")
+
+    return check
 
 
 def did_you_mean(name: str, known: Iterable[str], otherwise: str) -> str:

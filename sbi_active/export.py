@@ -18,7 +18,6 @@ from sbi_active.seeding import derive_seed, forked_generators
 from sbi_active.simulation import simulate
 
 if TYPE_CHECKING:
-    from sbi_active.actions import ActionSpace
     from sbi_active.campaign import Campaign
 
 
@@ -171,7 +170,8 @@ def _add_trials(
     action = torch.stack([t.action for t in trials])
     x = torch.stack([t.x for t in trials if t.x is not None])
     space, channels = campaign.actions, campaign.channel_names
-    _add_outcomes(made, campaign.simulator, draws, action, x, seed, space, channels)
+    named: Any = {"names": space.names, "units": space.units, "channels": channels}
+    _add_outcomes(made, campaign.simulator, draws, action, x, seed, **named)
 
 
 def _add_outcomes(
@@ -181,7 +181,9 @@ def _add_outcomes(
     action: Tensor,
     x: Tensor | None,
     seed: int,
-    space: ActionSpace | None = None,
+    *,
+    names: Sequence[str] = (),
+    units: Sequence[str] = (),
     channels: Sequence[str] | None = None,
 ) -> None:
     """Add what is predicted at actions, and what was measured there.
@@ -193,12 +195,13 @@ def _add_outcomes(
         action: Actions, shape (k, action_dim).
         x: Outcomes, shape (k, *x_shape); None if nothing was measured.
         seed: Seed of the simulations.
-        space: Action space, which names the entries; None numbers them.
+        names: Names of the action's entries; without any they are numbered.
+        units: Units of the entries that have one.
         channels: Names of the channels; None takes the simulator's.
     """
     action = torch.as_tensor(action).reshape(len(action), -1).float()
     x = None if x is None else torch.as_tensor(x)
-    names = getattr(space, "names", [f"action_{i + 1}" for i in range(action.shape[1])])
+    names = names or [f"action_{i + 1}" for i in range(action.shape[1])]
     channels = channels or getattr(simulator, "channel_names", None)
 
     def rows(theta: Tensor) -> tuple[Tensor, Tensor]:
@@ -219,8 +222,8 @@ def _add_outcomes(
     made.coords["action_entry"] = [*names]
     for group, outcomes in values.items():
         made.add(f"{group}_predictive", "x", outcomes, ["round", *dims])
-    units = {} if space is None else dict(zip(names, space.units, strict=True))
-    named = {f"unit_{name}": unit for name, unit in units.items() if unit}
+    pairs = zip(names, units, strict=False)
+    named = {f"unit_{name}": unit for name, unit in pairs if unit}
     made.add_data("constant_data", "action", action, ["round", "action_entry"], named)
     if x is None:
         return
@@ -255,12 +258,9 @@ def _add_report(
     made.add("posterior", "theta", draws, ["parameter"])
     residuals = report.residuals
     made.coords["round"] = [int(i) + 1 for i in residuals.index]
-    made.coords["action_entry"] = [*report.action_labels]
-    x = np.asarray(residuals.x)
-    dims = [f"x_dim_{i}" for i in range(x.ndim - 1)]
-    made.add_data("observed_data", "x", x, ["round", *dims])
-    pair = ["round", "action_entry"]
-    made.add_data("constant_data", "action", residuals.action, pair)
+    told = residuals.action, torch.as_tensor(residuals.x)
+    own = torch.as_tensor(draws), None
+    _add_outcomes(made, None, own, *told, seed, names=report.action_labels)
     log_prob = _rival_log_likelihood(report, found, draws)
     if log_prob is not None and not is_widened:
         made.add("log_likelihood", "x", log_prob, ["round"])

@@ -8,10 +8,10 @@ from __future__ import annotations
 
 import ast
 import functools
+import inspect
 import pkgutil
 import sys
 from collections.abc import Callable, Mapping
-from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -80,7 +80,7 @@ def grouped(values: Mapping[str, Any], groups: Mapping[str, Any]) -> dict[str, A
 
     Args:
         values: Values, some of which are fields of the settings.
-        groups: The class of each settings, a dataclass, by the name of its value.
+        groups: The class of each settings by the name of its value.
 
     Example:
         >>> from sbi_active.simulation import Workers
@@ -89,25 +89,24 @@ def grouped(values: Mapping[str, Any], groups: Mapping[str, Any]) -> dict[str, A
     """
     found = dict(values)
     for group, kind in groups.items():
-        names = [entry.name for entry in fields(kind) if entry.name in found]
+        names = [name for name in inspect.signature(kind).parameters if name in found]
         loose = {name: found.pop(name) for name in names}
         if loose:
             whole = found.get(group) or kind()
             whole = whole if isinstance(whole, kind) else kind(whole)
-            found[group] = replace(whole, **loose)
+            found[group] = kind(**{**vars(whole), **loose})
     return found
 
 
 def takes_loose(**groups: Any) -> Callable[[Taking], Taking]:
-    """Let a function or a dataclass take fields of its settings as keywords.
+    """Let a function or a class take fields of its settings as keywords.
 
-    They work for one version, with a warning. A dataclass has them as attributes as
-    well.
+    They work for one version, with a warning. A class has them as attributes as well.
 
     Args:
         **groups: Groups of options, as in :func:`grouped`.
     """
-    home = {entry.name: g for g, kind in groups.items() for entry in fields(kind)}
+    home = {name: g for g in groups for name in inspect.signature(groups[g]).parameters}
 
     def warned(what: str, name: str) -> None:
         place = f"{home[name]}={groups[home[name]].__name__}({name}=)"

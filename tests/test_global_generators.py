@@ -1,10 +1,9 @@
 """Who leaves the global generators of torch and NumPy as they were: see seeding."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 import torch
+from attrs import evolve
 
 from sbi_active import (
     ALHI,
@@ -81,7 +80,7 @@ def test_a_campaign(kept):
 @pytest.mark.parametrize("make", [ASBI, ALHI, SeqBED])
 def test_a_trainer_after_training(kept, make):
     network = RATIOS if make is SeqBED else OPTIONS.density_estimator
-    network = replace(network, num_iterations=5)
+    network = evolve(network, num_iterations=5)
     trainer = make(PRIOR, network, show_progress_bars=False)
     trainer.append_simulations(THETA, X, action=ACTION, belief=PRIOR).train()
     model = kept("build_posterior", trainer.build_posterior)

@@ -29,6 +29,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from attrs import evolve
 from sbi.utils import BoxUniform
 from torch import Tensor
 
@@ -96,7 +97,7 @@ def campaign(method: str) -> list[Any]:
     task = get_task("numerical")
     options = SMALL
     if method == "seqbed":
-        options = replace(SMALL, density_estimator=CampaignOptions().density_estimator)
+        options = evolve(SMALL, density_estimator=CampaignOptions().density_estimator)
     given = {"method": method, "seed": 3, "options": options}
     run = Campaign(task.simulator, task.prior, task.actions, **given)
     with forked_generators(4):
@@ -185,7 +186,7 @@ def many(num_parameters: int) -> list[Any]:
 def adoption() -> list[Any]:
     """Return a campaign before and after it adopts an effect."""
     problem = draw_case(get_world("A"), "library", 1, num_trials=8).problem
-    options = replace(SMALL, refinement=RefinementOptions(num_histories=400))
+    options = evolve(SMALL, refinement=RefinementOptions(num_histories=400))
     given = {"effects": problem.effects, "seed": 1, "options": options}
     run = Campaign(problem.model, problem.prior, get_world("A").actions, **given)
     trials = problem.trials

@@ -18,12 +18,12 @@ posterior density.
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
+from attrs import evolve
 from torch import Tensor
 
 from benchmarks.numerical.methods import FAITHFUL
@@ -177,7 +177,7 @@ OPTIONS = CampaignOptions(num_samples=250, details=CampaignDetails(num_scored=50
 #: methods differ: by default the declared noise gives both, whatever was learned.
 SETTINGS = {
     "default": OPTIONS,
-    "learned": replace(OPTIONS, refine=False),
+    "learned": evolve(OPTIONS, refine=False),
     "coverage": OPTIONS,
 }
 NUM_ROUNDS = {"default": 6, "learned": 6, "coverage": 3}
@@ -227,7 +227,7 @@ def options_of(method: str, setting: str) -> CampaignOptions:
     own = FAITHFUL[method]
     if setting == "learned":
         estimator = own.get("estimator", "posterior")
-        return replace(SETTINGS[setting], estimator=estimator)
+        return evolve(SETTINGS[setting], estimator=estimator)
     return SETTINGS[setting]
 
 

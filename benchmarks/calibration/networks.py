@@ -12,11 +12,11 @@ The share of networks or beliefs that are flagged, by problem and kind.
 from __future__ import annotations
 
 import time
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import torch
+from attrs import evolve
 from torch import Tensor
 
 from benchmarks.rows import benchmark, column, grouped
@@ -114,7 +114,7 @@ def network_row(problem: str, kind: str, seed: int) -> dict[str, object]:
     steps = settings.num_iterations
     if kind == "under":
         steps = 20 + derive_seed(seed, "steps") % 81
-        under = replace(MixtureDensity.faithful(), num_iterations=steps)
+        under = evolve(MixtureDensity.faithful(), num_iterations=steps)
         inference = train(task, under, NUM_UNDER, seed)
     else:
         inference = train(task, settings, rows, seed)

@@ -20,11 +20,11 @@ method and setting, in benchmarks/numerical/results.
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import torch
+from attrs import evolve
 from sbi.utils.metrics import c2st
 from torch import Tensor
 
@@ -83,12 +83,12 @@ def options_of(setting: str, method: str) -> CampaignOptions:
     """
     designs = METHODS[method].designs
     if setting == "faithful":
-        options = replace(CampaignOptions.faithful(), **FAITHFUL[method])
-        return options if designs else replace(options, num_simulations=NUM_FAITHFUL)
+        options = evolve(CampaignOptions.faithful(), **FAITHFUL[method])
+        return options if designs else evolve(options, num_simulations=NUM_FAITHFUL)
     options = CampaignOptions()
     if not designs:
         num = options.num_simulations + NUM_DESIGN
-        options = replace(options, num_simulations=num)
+        options = evolve(options, num_simulations=num)
     return options
 
 

@@ -12,12 +12,12 @@ setting, in benchmarks/numerical/results; the table is printed at the end.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
+from attrs import evolve
 from torch import Tensor
 
 from benchmarks.rounds import drawn_truth, last_round, played
@@ -33,7 +33,7 @@ REPORTED = (-3.0, 0.0, 3.0)  # actions of the paper's Table 1
 SETTINGS: dict[str, CampaignOptions] = {
     "faithful": CampaignOptions.faithful(),
     "default": CampaignOptions(),
-    "default_500": replace(
+    "default_500": evolve(
         CampaignOptions(), refinement=RefinementOptions(num_histories=500)
     ),
 }

@@ -15,12 +15,13 @@ are those of all pours, since one network is shown all actions.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
+from attrs import evolve
 from torch import Tensor
 
 from benchmarks.pouring.bank import read_parts
@@ -104,11 +105,11 @@ def learn_networks(folder: Path) -> ByNetwork:
     mesh, small = summaries_of(rows, task)
     mean, axes = components(small, NUM_COMPONENTS)
     faithful = MixtureDensity.faithful()
-    settings = replace(
+    settings = evolve(
         faithful,
         hidden_features=HIDDEN,
         num_iterations=NUM_ITERATIONS,
-        details=replace(faithful.details, batch_size=BATCH),
+        details=evolve(faithful.details, batch_size=BATCH),
     )
     networks = []
     for summary in ((small - mean) @ axes, np.sqrt(mesh)):

@@ -27,11 +27,12 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import torch
+from attrs import evolve
 from torch import Tensor
 from torch.distributions import Distribution, MultivariateNormal
 
@@ -94,7 +95,7 @@ class Problem:
         """Return the belief after the trials, one update each."""
         settings = RefinementOptions()
         if num_histories is not None:
-            settings = replace(settings, num_histories=num_histories)
+            settings = evolve(settings, num_histories=num_histories)
         inference = ASBI(self.prior, show_progress_bars=False)
         trials = list(zip(self.action, self.x, strict=True))
         for k, (action, x) in enumerate(trials):

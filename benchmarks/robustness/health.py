@@ -17,11 +17,11 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import torch
+from attrs import evolve
 from torch import Tensor
 from torch.distributions import MultivariateNormal
 
@@ -60,7 +60,7 @@ CHEAP = CampaignOptions(
     refinement=RefinementOptions(num_histories=1_000),
 )
 #: For campaigns of many numbers, which cost more.
-CHEAPER = replace(
+CHEAPER = evolve(
     CHEAP,
     details=CampaignDetails(num_scored=1_000),
     refinement=RefinementOptions(num_histories=400),

@@ -293,12 +293,11 @@ class Campaign(CampaignTrials):
         if state.is_stale:
             recompute(state, learner)
             self._storage.save(state, learner)
-        for trial in self.history:
-            if trial.index in state.processed:
-                continue
+        for trial in [t for t in self.history if t.index not in state.processed]:
             if trial.is_measured and not learner.takes(trial):
                 break
             state.processed.append(trial.index)
+            state.change(trial.index, health=self.health)
             if trial.is_measured:
                 state.keep_draws(learner.belief)
             self._storage.save(state, learner)

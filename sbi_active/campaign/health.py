@@ -9,17 +9,16 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Sequence
-from typing import Any, Literal
+from typing import Any
 
 import torch
 from torch import Tensor
 from torch.distributions import Distribution
 
-from sbi_active.campaign.state import FAR, CampaignState, ModelVersion, Trial
+from sbi_active.campaign.state import FAR, CampaignState, Trial, first_numbers
+from sbi_active.campaign.telling import Health
 from sbi_active.inference.beliefs.belief import UnchangedBelief
 from sbi_active.inference.beliefs.diagnostics import Diagnostics
-
-Health = Literal["ok", "watch", "alarm"]
 
 
 def assess(state: CampaignState, *, alarm: float = 0.05, watch: float = 0.25) -> Health:
@@ -51,39 +50,13 @@ def assess(state: CampaignState, *, alarm: float = 0.05, watch: float = 0.25) ->
         Vovk & Wang, Annals of Statistics 2021 (e-values from p-values); Ville, Etude
         critique de la notion de collectif, 1939.
     """
-    version = state.version
-    trials = [t for t in state.measured if t.version == version.number]
-    return _health(version, trials, alarm, watch)
-
-
-def health_by_trial(state: CampaignState) -> dict[int, Health]:
-    """Return the health when each trial had been used, without those not scored."""
-    scored: dict[int, list[Trial]] = {v.number: [] for v in state.versions}
-    found = {}
-    for index in state.processed:
-        trial = state.trials[index]
-        if trial.is_measured:
-            if trial.version is None:
-                continue
-            scored[trial.version].append(trial)
-        then = [v for v in state.versions if not v.number or index not in v.trials][-1]
-        found[index] = _health(then, scored[then.number])
-    return found
-
-
-def _health(
-    version: ModelVersion,
-    trials: Sequence[Trial],
-    alarm: float = 0.05,
-    watch: float = 0.25,
-) -> Health:
-    """Return the health of a model after trials that it scored, see :func:`assess`."""
+    trials = [t for t in state.measured if t.version == state.version.number]
     bet = largest_bet = 0.0
     for trial in trials:
         if trial.surprise is not None and not is_off(trial.belief_error or 0.0):
             bet += log_e_value(trial.surprise)
             largest_bet = max(largest_bet, bet)
-    misfits = [version.misfit, *(t.misfit for t in trials)]
+    misfits = [state.version.misfit, *(t.misfit for t in trials)]
     known = enumerate((m for m in misfits if m is not None), 1)
     least = min((m * t * (t + 1) for t, m in known), default=math.inf)
     if largest_bet >= math.log(2 / alarm) or least < alarm / 2:
@@ -222,7 +195,8 @@ def in_doubt(
 
 def _doubt(trial: Trial) -> str:
     far, index = trial.outlyingness or 0.0, trial.index
-    where = f"trial {index} at action {_shown(trial.action)}: x = {_shown(trial.x)} "
+    action, x = map(first_numbers, (trial.action, trial.x))
+    where = f"trial {index} at action [{action}]: x = [{x}] "
     if math.isinf(far):
         what = "has numbers that no simulation from the prior has"
     else:
@@ -235,9 +209,3 @@ def _doubt(trial: Trial) -> str:
         f"SA102 {where}{what}{so}; correct or withdraw trial {index}, and criticize "
         "where it is right"
     )
-
-
-def _shown(values: Tensor | None) -> str:
-    numbers = [] if values is None else values.flatten().tolist()
-    shown = ", ".join(f"{v:.6g}" for v in numbers[:6])
-    return f"[{shown}{', ...' if len(numbers) > 6 else ''}]"

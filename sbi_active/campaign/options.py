@@ -2,22 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, Literal
 
 import cloudpickle
-import numpy as np
 import torch
+from attrs import field, frozen
 from torch.distributions import Distribution
 
 from sbi_active.design.design import Design
 from sbi_active.design.estimators.automatic import find_estimator
 from sbi_active.expected import (
+    at_least,
+    of_class,
+    one_of,
+    positive,
     require,
-    require_kinds,
-    require_least,
-    require_one_of,
     suggests,
 )
 from sbi_active.inference.declared.settings import RefinementOptions
@@ -28,7 +28,7 @@ from sbi_active.simulation.workers.settings import IN_PROCESS, Workers
 
 
 @suggests
-@dataclass(frozen=True, kw_only=True)
+@frozen(kw_only=True, slots=False)
 class CampaignDetails:
     """Options that few campaigns change; the papers' experiments do.
 
@@ -44,18 +44,27 @@ class CampaignDetails:
     """
 
     posterior: str = "importance"
-    eliminate: bool = True
-    num_scored: int = 2_000
-    look_ahead: int = 2
+    eliminate: bool = field(default=True, validator=of_class(bool))
+    num_scored: int = field(
+        default=2_000,
+        validator=at_least(
+            100, "use about 2000: no tail probability is below 1 / (num_scored + 1)"
+        ),
+    )
+    look_ahead: int = field(default=2, validator=one_of(1, 2))
 
-    def __post_init__(self) -> None:
-        advice = "use about 2000: no tail probability is below 1 / (num_scored + 1)"
-        require_least(self, advice, num_scored=100)
-        require_one_of(self, look_ahead=(1, 2))
+
+#: Of rules to stop by: none of them has to be given.
+_limit = positive("leave a rule at None that is not wanted")
+
+
+def _numbers(limit: float | Iterable[float] | None) -> float | Sequence[float] | None:
+    """Return a limit as it is, or several as a tuple of numbers."""
+    return (*map(float, limit),) if isinstance(limit, Iterable) else limit
 
 
 @suggests
-@dataclass(frozen=True, kw_only=True)
+@frozen(kw_only=True, slots=False)
 class StopRules:
     """Rules by which :meth:`.Campaign.run` ends before its last round.
 
@@ -76,20 +85,11 @@ class StopRules:
         StopRules(min_information_gain=0.1, max_sd=(0.05, 0.2), budget=None)
     """
 
-    min_information_gain: float | None = None
-    max_sd: float | Sequence[float] | None = None
-    budget: float | None = None
-
-    def __post_init__(self) -> None:
-        if isinstance(self.max_sd, Sequence):
-            object.__setattr__(self, "max_sd", (*map(float, self.max_sd),))
-        limits = (self.min_information_gain, self.max_sd, self.budget)
-        require(
-            all(np.all(np.array(limit) > 0) for limit in limits if limit is not None),
-            "positive limits to stop at",
-            self,
-            "leave a rule at None that is not wanted",
-        )
+    min_information_gain: float | None = field(default=None, validator=_limit)
+    max_sd: float | Sequence[float] | None = field(
+        default=None, converter=_numbers, validator=_limit
+    )
+    budget: float | None = field(default=None, validator=_limit)
 
     def reason(
         self,
@@ -134,14 +134,30 @@ class StopRules:
         return f"the parameters' standard deviations are {widths}, below max_sd"
 
 
+def _is_estimator(options: Any, attribute: Any, value: Any) -> None:
+    find_estimator(value)
+
+
+def _are_of_refinement_too(options: Any, attribute: Any, workers: Workers) -> None:
+    require(
+        options.refinement.workers in (IN_PROCESS, workers),
+        f"the refinement's simulations to run as all others of a campaign, {workers}",
+        f"{options.refinement.workers} for them",
+        "pass workers to CampaignOptions alone",
+    )
+
+
 #: Settings whose fields were options of a campaign in the last version.
 GROUPS = {"workers": Workers, "details": CampaignDetails}
 
 
 @takes_loose(**GROUPS)
-@dataclass(frozen=True, kw_only=True)
+@frozen(kw_only=True, slots=False)
 class CampaignOptions:
     """Sizes and estimators of a campaign.
+
+    ``attrs.evolve(options, num_samples=500)`` returns a copy with another value, of
+    these and all other options.
 
     Attributes:
         num_simulations: Number of training rows in each round.
@@ -178,19 +194,38 @@ class CampaignOptions:
         details: Further options that few campaigns change.
     """
 
-    num_simulations: int = 5_000
-    num_samples: int = 1_500
+    num_simulations: int = field(
+        default=5_000, validator=at_least(100, "use about 5000 a round")
+    )
+    num_samples: int = field(
+        default=1_500, validator=at_least(8, "use about 1500 an action")
+    )
     density_estimator: Any = None
-    estimator: Any = "auto"
-    refine: bool = True
-    network: Literal["each round", "on demand"] = "each round"
-    refinement: RefinementOptions = RefinementOptions()
-    check_every: int | None = None
-    stop: StopRules = StopRules()
-    max_simulations: int | None = None
-    planned_trials: int = 6
-    workers: Workers = IN_PROCESS
-    details: CampaignDetails = CampaignDetails()
+    estimator: Any = field(default="auto", validator=_is_estimator)
+    refine: bool = field(default=True, validator=of_class(bool))
+    network: Literal["each round", "on demand"] = field(
+        default="each round", validator=one_of("each round", "on demand")
+    )
+    refinement: RefinementOptions = field(
+        default=RefinementOptions(), validator=of_class(RefinementOptions)
+    )
+    check_every: int | None = field(
+        default=None,
+        validator=at_least(1, "use 2 or 3 where the simulator may lack something"),
+    )
+    stop: StopRules = field(default=StopRules(), validator=of_class(StopRules))
+    max_simulations: int | None = field(
+        default=None, validator=at_least(100, "use some hundred a trial")
+    )
+    planned_trials: int = field(
+        default=6, validator=at_least(1, "pass the number of trials that you can run")
+    )
+    workers: Workers = field(
+        default=IN_PROCESS, converter=Workers.of, validator=_are_of_refinement_too
+    )
+    details: CampaignDetails = field(
+        default=CampaignDetails(), validator=of_class(CampaignDetails)
+    )
 
     def __getstate__(self) -> dict[str, Any]:
         # Builders of sbi's are local functions, which pickle refuses.
@@ -234,24 +269,3 @@ class CampaignOptions:
             refine=False,
             details=CampaignDetails(eliminate=False),
         )
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "workers", Workers.of(self.workers))
-        settings = {"refinement": RefinementOptions, "details": CampaignDetails}
-        require_kinds(self, refine=bool, stop=StopRules, **settings)
-        find_estimator(self.estimator)  # an unknown name is an error here
-        require(
-            self.refinement.workers in (IN_PROCESS, self.workers),
-            "the refinement's simulations to run as all others of a campaign, "
-            f"{self.workers}",
-            f"{self.refinement.workers} for them",
-            "pass workers to CampaignOptions alone",
-        )
-        require_one_of(self, network=("each round", "on demand"))
-        require_least(self, "use about 5000 a round", num_simulations=100)
-        require_least(self, "use about 1500 an action", num_samples=8)
-        require_least(self, "use some hundred a trial", max_simulations=100)
-        advice = "pass the number of trials that you can run"
-        require_least(self, advice, planned_trials=1)
-        advice = "use 2 or 3 where the simulator may lack something"
-        require_least(self, advice, check_every=1)

@@ -16,10 +16,8 @@ from torch.distributions import Distribution
 
 from sbi_active import progress
 from sbi_active.campaign.options import CampaignOptions
-from sbi_active.campaign.telling import Facts, Status, facts_in
+from sbi_active.campaign.telling import Facts, Health, Status, facts_in
 from sbi_active.design.design import Design
-from sbi_active.display.notebook import card, facts
-from sbi_active.display.table import number
 from sbi_active.inference.emulation.pool import Batch
 from sbi_active.messages import warn
 from sbi_active.seeding import derive_seed, forked_generators
@@ -64,6 +62,7 @@ class Trial:
         reason: Reason for which it was withdrawn.
         cost: Cost of the executed action, also of a trial that was missing or withdrawn
             since; None while it is pending, and without a cost or a budget.
+        health: Health of the campaign when the trial had been used; None before.
         version: Number of the model that scored the trial.
         seconds: Wall time by stage; it and what follows add up if computed again.
         cpu_seconds: CPU time by stage.
@@ -86,6 +85,7 @@ class Trial:
     summary: str | None = None
     reason: str = ""
     cost: float | None = None
+    health: Health | None = None
     version: int | None = None
     seconds: dict[str, float] = field(default_factory=dict)
     cpu_seconds: dict[str, float] = field(default_factory=dict)
@@ -93,38 +93,15 @@ class Trial:
     num_missing: int = 0
 
     def __repr__(self) -> str:
-        outcome = "" if self.x is None else f", x [{_first(self.x)}]"
+        outcome = "" if self.x is None else f", x [{first_numbers(self.x)}]"
         gain = self.information_gained
         told = "" if gain is None else f", {gain:.2f} nats"
-        action = _first(self.action)
+        action = first_numbers(self.action)
         return f"Trial({self.index}: action [{action}], {self.status}{outcome}{told})"
-
-    def _repr_html_(self) -> str:
-        gain, error = map(number, self.expected_gain)
-        pairs = [
-            ("action", _first(self.action, self.design and self.design.labels)),
-            ("outcome", _first(self.x) if self.status != "invalid" else ""),
-            ("chosen for", self.target),
-            ("expected to tell", f"{gain} ± {error or '?'} nats" if gain else ""),
-            ("told", _with(self.information_gained, "nats")),
-            ("surprise", _with(self.surprise)),
-            ("misfit after it", _with(self.misfit)),
-            ("beyond all simulations by", _with(self.outlyingness, "of their ranges")),
-            ("simulations", self.num_simulations),
-            ("lost of them", self.num_missing),
-            ("cost", _with(self.cost)),
-            ("time", _with(sum(self.seconds.values()) or None, "s")),
-            ("reason", self.reason),
-        ]
-        shown = [(name, value) for name, value in pairs if value]
-        return card(f"Trial {self.index}: {self.status}", facts(shown))
 
     @property
     def expected_gain(self) -> tuple[float, float]:
-        """The action's expected information gain and its standard error, nats.
-
-        They are NaN for a trial that was not designed.
-        """
+        """Its expected gain and the standard error, nats; NaN if not designed."""
         design = self.design
         if design is None:
             return float("nan"), float("nan")
@@ -174,7 +151,7 @@ class ModelVersion:
 #: Fields of a trial that was not scored.
 UNSCORED: dict[str, Any] = dict.fromkeys(
     ("information_gained", "surprise", "belief_error", "log_score", "misfit")
-    + ("outlyingness", "version")
+    + ("outlyingness", "health", "version")
 )
 
 
@@ -184,17 +161,9 @@ def tensor_of(listed: Any) -> Tensor:
         return torch.from_numpy(np.array(listed, np.float64)).float()
 
 
-def _with(value: float | None, unit: str = "") -> str:
-    return f"{number(value)} {unit}".strip() if value is not None else ""
-
-
-def _first(
-    values: Tensor | None, labels: Sequence[str] | None = None, most: int = 6
-) -> str:
-    """Return the first numbers of an action or an outcome, after their labels."""
+def first_numbers(values: Tensor | None, most: int = 6) -> str:
+    """Return the first numbers of an action or an outcome."""
     numbers = [] if values is None else [f"{v:.4g}" for v in values.flatten().tolist()]
-    if labels and len(labels) == len(numbers):
-        numbers = [f"{a} {v}" for a, v in zip(labels, numbers, strict=True)]
     left = len(numbers) - most
     shown = ", ".join(numbers[:most])
     return f"{shown} and {left} more" if left > 0 else shown

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 
 Kept = TypeVar("Kept")  # what a campaign keeps of a trial
 Status = Literal["pending", "ok", "invalid", "missing", "withdrawn"]
+Health = Literal["ok", "watch", "alarm"]
 
 #: Records of a campaign's store: what happened, what was computed from it, and what a
 #: reader without torch needs of that.

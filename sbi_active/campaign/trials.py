@@ -15,16 +15,11 @@ from sbi_active.actions import ActionSpace
 from sbi_active.arrays import measured
 from sbi_active.campaign.display.figures import plot_campaign
 from sbi_active.campaign.display.page import campaign_html, to_dataframe
-from sbi_active.campaign.health import (
-    Health,
-    assess,
-    doubts,
-    in_doubt,
-)
+from sbi_active.campaign.health import assess, doubts, in_doubt
 from sbi_active.campaign.isolation import guarded
 from sbi_active.campaign.state import CampaignState, Trial, tensor_of
 from sbi_active.campaign.storage.directory import Storage
-from sbi_active.campaign.telling import Facts, Telling, listed
+from sbi_active.campaign.telling import Facts, Health, Telling, listed
 from sbi_active.display.figures import legible
 from sbi_active.inference.beliefs.belief import named, names_of, parameter_dim
 from sbi_active.inference.rounds.condition import action_rows, outcome_rows

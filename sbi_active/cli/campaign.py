@@ -228,9 +228,10 @@ def adopt(campaign: Any) -> cli.Answer:
 @on_campaign(cli.option("--out", "where to", cli.FILE, "PAGE.html"))
 def report(campaign: Any, out: Path | None) -> cli.Answer:
     """Write one page that shows the campaign."""
-    from sbi_active.campaign.display.page import write_page
+    from sbi_active.campaign.display.page import page
 
-    path = write_page(campaign, out or Path(campaign.directory, "report.html"))
+    path = out or Path(campaign.directory, "report.html")
+    path.write_text(page(campaign), encoding="utf-8")
     return cli.Answer({"saved": str(path)}, f"saved: {path}")
 
 

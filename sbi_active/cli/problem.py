@@ -15,12 +15,12 @@ import os
 import sys
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import replace
 from operator import lt
 from pathlib import Path
 from typing import Any
 
 import torch
+from attrs import evolve
 from sbi.utils import BoxUniform
 from torch import Tensor
 from torch.distributions import Distribution
@@ -80,7 +80,7 @@ def campaign_options(texts: Sequence[str]) -> CampaignOptions:
 def _changed(settings: Any, names: Sequence[str], value: Any) -> Any:
     name, *rest = names
     value = _changed(getattr(settings, name), rest, value) if rest else value
-    return replace(settings, **{name: value})
+    return evolve(settings, **{name: value})
 
 
 def task_of(name: str, texts: Sequence[str]) -> Task:

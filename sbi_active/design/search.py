@@ -6,8 +6,10 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
+from typing import ClassVar
 
 import torch
+from attrs import frozen
 from scipy.optimize import minimize
 from torch import Tensor
 from typing_extensions import override
@@ -15,7 +17,7 @@ from typing_extensions import override
 from sbi_active.actions import ActionSpace
 from sbi_active.arrays import Array
 from sbi_active.design.coordinates import Coordinates
-from sbi_active.expected import Shown, require_least
+from sbi_active.expected import Shown
 from sbi_active.inference.sampling.gaussian_process import IN_CUBE, GaussianProcess
 from sbi_active.seeding import derive_seed
 
@@ -105,7 +107,7 @@ class Search(Shown, ABC):
         """Return actions, shape (a, action_dim), the best of which is then chosen."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen(slots=False)
 class GradientSearch(Search):
     r"""Ascend a smooth regression of the utility from many starts.
 
@@ -125,7 +127,7 @@ class GradientSearch(Search):
     of a round are chosen from the ends one after the other, each as if those before had
     been evaluated. A point that leaves what is permitted goes back to its edge.
 
-    Args:
+    Attributes:
         num_rounds: Rounds after the first.
         num_finalists: Actions to compare in the end.
         num_starts: Number of starts of an ascent.
@@ -137,26 +139,19 @@ class GradientSearch(Search):
         each: Candidates' worth of simulations for each degree of freedom (an entry of a
             box, a category after the first), and for none.
 
-    Raises:
-        ValueError: If a number of rounds, finalists or starts is below 1.
-
     References:
         Klein et al., arXiv 2602.06900 (design by gradients of neural estimates);
         Desautels, Krause & Burdick, JMLR 2014 (batches by upper confidence bounds).
     """
 
-    num_rounds: int = 6
-    num_finalists: int = 5
-    num_starts: int = 64
-    optimism: float = 2.0
-    apart: float = 0.02
-    penalty: float = 10.0
-    fewest: int = 8
-    each: int = 4
-
-    def __post_init__(self) -> None:
-        least = {"num_rounds": 1, "num_finalists": 1, "num_starts": 1}
-        require_least(self, "use about 6, 5 and 64 of them", **least)
+    num_rounds: ClassVar[int] = 6
+    num_finalists: ClassVar[int] = 5
+    num_starts: ClassVar[int] = 64
+    optimism: ClassVar[float] = 2.0
+    apart: ClassVar[float] = 0.02
+    penalty: ClassVar[float] = 10.0
+    fewest: ClassVar[int] = 8
+    each: ClassVar[int] = 4
 
     @override
     def size(self, actions: ActionSpace) -> int:

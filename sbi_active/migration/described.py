@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import dataclasses
+import inspect
 from collections.abc import Mapping
 from typing import Any
 
@@ -86,7 +86,7 @@ def options_from(described: Any) -> Any:
     if "number" in described:
         return float(described["number"])
     kind = _SETTINGS[described["settings"]]
-    known = {f.name for f in dataclasses.fields(kind)}
+    known = inspect.signature(kind).parameters
     values = {name: options_from(value) for name, value in described.items()}
     values = grouped(values, _GROUPS.get(kind, {}))
     return kind(**{name: value for name, value in values.items() if name in known})

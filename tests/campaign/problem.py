@@ -1,8 +1,7 @@
 """One parameter, a push and noise of a tenth: a campaign of a fraction of a second."""
 
-from dataclasses import replace
-
 import torch
+from attrs import evolve
 from sbi.utils import BoxUniform
 
 from sbi_active import (
@@ -40,7 +39,7 @@ def noisy(theta, action):
 def campaign(method="nsbi", simulator=MODEL, *, actions=ACTIONS, given=None, **changes):
     """Return a campaign with options changed, and further arguments given."""
     network = RATIOS if method == "seqbed" else OPTIONS.density_estimator
-    options = replace(OPTIONS, **{"density_estimator": network, **changes})
+    options = evolve(OPTIONS, **{"density_estimator": network, **changes})
     return Campaign(
         simulator, PRIOR, actions, method=method, options=options, **(given or {})
     )

@@ -205,10 +205,10 @@ def test_the_smallest_options_are_taken():
 
 @pytest.mark.parametrize("limit", [0.0, -1.0, [0.1, 0.0]])
 def test_limits_to_stop_at_are_positive(limit):
-    with pytest.raises(ValueError, match="expected positive limits to stop at"):
+    with pytest.raises(ValueError, match="expected max_sd > 0 or None; got"):
         StopRules(max_sd=limit)
     if not isinstance(limit, list):
-        with pytest.raises(ValueError, match="expected positive limits to stop at"):
+        with pytest.raises(ValueError, match="expected min_information_gain > 0"):
             StopRules(min_information_gain=limit)
 
 

@@ -194,3 +194,23 @@ def test_few_simulations_know_a_mean_that_is_wide_beside_its_noise():
     off = exact.log_prob(theta) - belief.log_prob(theta.float()).double()
     assert float(off.abs().max()) < 0.3
     assert c.state.meter.spent <= 200
+
+
+def test_rows_lost_to_faults_are_counted_once():
+    lost = set()
+
+    def fails(theta, action, rng):
+        if theta[0] % 0.1 < 0.02:
+            lost.add((*theta.tolist(), *action.tolist()))
+            raise RuntimeError("licence server")
+        x = [theta[0] * action[0], theta[1]] + 0.1 * rng.normal(size=2)
+        return torch.from_numpy(x)
+
+    model = SimulatorModel(fails, batched=False)
+    options = {"max_simulations": 400, "planned_trials": 2}
+    c = Campaign(model, PRIOR, DiscreteActions([0.5, 1.0]), options=options)
+    c.run(lambda action: torch.tensor([0.6 * float(action[0]), 0.3]), num_rounds=2)
+    c.update()
+    assert 20 < len(lost) == sum(t.num_missing for t in c.history)
+    spent = sum(t.num_simulations for t in c.history)
+    assert 0 <= c.state.meter.spent - spent <= 16  # looked at before the first trial

@@ -9,12 +9,10 @@ import torch
 from torch import Tensor
 
 from sbi_active.arrays import Array
-from sbi_active.campaign.health import health_by_trial
 from sbi_active.design.design import action_labels
 from sbi_active.design.drawing import draw
 from sbi_active.display.table import within
 from sbi_active.seeding import derive_seed, forked_generators
-from sbi_active.simulation import simulate
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -103,13 +101,9 @@ def predict(campaign: Any, num_simulations: int) -> dict[int, Array]:
     for index in state.processed:
         trial = state.trials[index]
         if trial.status == "ok" and before.shape[1] == dim:
-            rows = simulate(
-                campaign._learner.at(index),
-                before[torch.arange(num_simulations) % len(before)],
-                trial.action.expand(num_simulations, -1),
-                seed=derive_seed(state.seed, "shown", index),
-                workers=state.options.workers,
-            )
+            theta = before[torch.arange(num_simulations) % len(before)]
+            seed = derive_seed(state.seed, "shown", index)
+            rows = campaign._learner.outcomes(trial, theta, seed)
             x = rows.without_missing().x.flatten(1).double().numpy()
             if np.isfinite(x).any():
                 found[index] = x
@@ -240,8 +234,7 @@ def _draw_information(ax: Axes, state: Any) -> None:
     used = [t for t in state.trials if t.information_gained is not None]
     index = [t.index for t in used]
     gained = np.array([t.information_gained for t in used], dtype=float)
-    health = health_by_trial(state)
-    colors = [BARS[health.get(i)] for i in index]
+    colors = [BARS[t.health] for t in used]
     ax.bar(index, gained, color=colors, alpha=0.7, width=0.7, label="gained")
     ax.plot(index, gained.cumsum(), "-", color=FAINT, lw=1.5, label="in all")
     expected = [(t.index, *t.expected_gain) for t in state.trials]

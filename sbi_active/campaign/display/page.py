@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sbi_active.campaign.health import health_by_trial
 from sbi_active.design.design import action_labels
 from sbi_active.display.notebook import badge, card, table
 from sbi_active.display.page import Page, Picture, Section
@@ -46,7 +43,7 @@ def to_dataframe(campaign: Any) -> DataFrame:
     own = (*FIRST, *LAST)
     labels = [_apart(n, "action", own) for n in action_labels(actions)]
     told = [_apart(n, "outcome", (*own, *labels)) for n in numbers or ["x"]]
-    rows, healths = [], health_by_trial(state)
+    rows: list[dict[str, Any]] = []
     for trial in state.trials:
         gain, error = trial.expected_gain
         row = {name: getattr(trial, name, None) for name in own}
@@ -54,7 +51,6 @@ def to_dataframe(campaign: Any) -> DataFrame:
             "trial": trial.index,
             "expected_information": gain,
             "expected_information_error": error,
-            "health": healths.get(trial.index),
             "seconds": sum(trial.seconds.values()),
             "cpu_seconds": sum(trial.cpu_seconds.values()),
         }
@@ -68,11 +64,7 @@ def to_dataframe(campaign: Any) -> DataFrame:
     types: dict[str, Any] = dict.fromkeys(NUMBERS, "float64") | {"version": "Int64"}
     frame = frame.astype(types).set_index("trial")
     frame.attrs = {
-        "method": state.method,
-        "seed": state.seed,
         "parameter_names": [*campaign.parameter_names],
-        "action_names": [*actions.names],
-        "action_units": [*actions.units],
         "units": dict.fromkeys((*NUMBERS[:3], "log_score"), "nats")
         | dict.fromkeys(("seconds", "cpu_seconds"), "s")
         | dict(zip(labels, actions.units, strict=True)),
@@ -162,13 +154,6 @@ def page(campaign: Any, num_draws: int = 4_000) -> str:
     ).html({"course": figure})
     plt.close(figure)
     return made
-
-
-def write_page(campaign: Any, path: str | os.PathLike[str]) -> Path:
-    """Write :func:`page` to a file, and return its path."""
-    path = Path(path)
-    path.write_text(page(campaign), encoding="utf-8")
-    return path
 
 
 def campaign_html(campaign: Any, most: int = 12) -> str:

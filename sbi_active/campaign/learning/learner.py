@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from functools import cached_property
 from typing import Any
 
 import torch
+from attrs import evolve
 from torch import Tensor
 from torch.distributions import Distribution
 
@@ -40,7 +40,7 @@ from sbi_active.inference.rounds.rows import Observation, UnexplainedOutcomeErro
 from sbi_active.inference.trainers.base import ActiveInference
 from sbi_active.messages import warn
 from sbi_active.seeding import derive_seed, forked_generators
-from sbi_active.simulation import simulate
+from sbi_active.simulation import Simulations, simulate
 from sbi_active.simulation.workers.store import SimulationBudgetError
 
 
@@ -111,6 +111,11 @@ class Learner:
         """Whether the simulator is another one at each trial."""
         seed = derive_seed(self.state.seed, "index")
         return depends_on_index(self.simulator, self.prior, self.actions, seed=seed)
+
+    @property
+    def infers_anew(self) -> bool:
+        """Whether a belief is that of all trials at once, and not of one more."""
+        return not self.has_networks or self.has_index
 
     def resume(self, belief: Callable[[], Distribution]) -> None:
         """Go on where ``state.processed`` ends.
@@ -203,15 +208,15 @@ class Learner:
         seed = derive_seed(self.state.seed, purpose, index)
         with forked_generators(seed, "theta"):
             theta = source.sample(torch.Size([num]))
-        rows = simulate(
-            self.at(index),
-            theta,
-            trial.action.expand(num, -1),
-            seed=derive_seed(seed, "x"),
-            workers=options.workers,
-        )
+        rows = self.outcomes(trial, theta, derive_seed(seed, "x"))
         self.state.account(index, num, rows.counts["missing"])
         return rows.without_missing().x
+
+    def outcomes(self, trial: Trial, theta: Tensor, seed: int) -> Simulations:
+        """Return outcomes of a trial's action at parameters (n, theta_dim)."""
+        action = self.simulated(trial.action).expand(len(theta), -1)
+        how: Any = {"seed": seed, "workers": self.state.options.workers}
+        return simulate(self.at(trial.index), theta, action, **how)
 
     def _examined(self, trial: Trial) -> Trial:
         """Compare a trial that the belief did not lead to with all of the prior."""
@@ -247,38 +252,36 @@ class Learner:
         self._prepare(index)
         before = self.belief
         with state.stage(index, "update"):
-            belief, *spent = self._updated(trial)
+            belief = self._updated(trial)
             seed = derive_seed(state.seed, "gain", index)
             gained = information_gained(belief, before, seed=seed)
-        self.round = Round(self)
-        state.account(index, *spent)
-        return {"information_gained": gained, "misfit": misfit(belief.diagnostics)}
+        self.round, figures = Round(self), belief.diagnostics
+        state.account(index, figures.num_simulations, figures.num_missing)
+        return {"information_gained": gained, "misfit": misfit(figures)}
 
     def _prepare(self, index: int) -> None:
         """Train the network that the update of a trial uses."""
         refine = self.state.options.refine
-        if not self.has_index and (self.trains_each_round or not refine):
+        if not self.infers_anew and (self.trains_each_round or not refine):
             self.round.trained(index)
 
-    def _updated(self, trial: Trial) -> tuple[Any, int, int]:
-        """Return the belief with one more trial, its simulations and those missing."""
+    def _updated(self, trial: Trial) -> Any:
+        """Return the belief with one more trial."""
         state = self.state
-        if self.has_index:
+        if self.infers_anew:
             earlier = [t for t in state.explained if t.index != trial.index]
-            belief = self._inferred([*earlier, trial], trial.index)
-        else:
-            with forked_generators(state.seed, "update", trial.index):
-                assert trial.x is not None
-                belief = self.inference.update(
-                    trial.x,
-                    action=trial.action,
-                    simulator=self.simulator if state.options.refine else None,
-                    refinement=self._refinement,
-                    seed=derive_seed(state.seed, "refine", trial.index),
-                )
-            note_combinations(belief, self._names, seed=state.seed)
-        figures = belief.diagnostics
-        return belief, figures.num_simulations, figures.num_missing
+            return self._inferred([*earlier, trial], trial.index)
+        with forked_generators(state.seed, "update", trial.index):
+            assert trial.x is not None
+            belief: Any = self.inference.update(
+                trial.x,
+                action=trial.action,
+                simulator=self.simulator if state.options.refine else None,
+                refinement=self._refinement,
+                seed=derive_seed(state.seed, "refine", trial.index),
+            )
+        note_combinations(belief, self._names, seed=state.seed)
+        return belief
 
     def infer(self, trials: Sequence[Trial]) -> float | None:
         """Replace the belief by that of these trials, from scratch.
@@ -308,7 +311,7 @@ class Learner:
     @property
     def _refinement(self) -> RefinementOptions:
         options = self.state.options
-        return replace(options.refinement, workers=options.workers)
+        return evolve(options.refinement, workers=options.workers)
 
     def simulated(self, action: Tensor) -> Tensor:
         """Return actions (..., action_dim) as the simulator gets them."""

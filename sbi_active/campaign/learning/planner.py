@@ -71,8 +71,7 @@ class Planner:
         self._limits = DesignLimits(actions, constraint, cost)
         # A wrong shape is an error here, and not in a later round.
         permitted(self._limits)
-        listed = actions.listed()
-        some = actions.sample((8,), seed=0) if listed is None else listed
+        some = _listed_or_drawn(actions, 8)
         self._limits.cost(some)
         self._limits.after(some[0]).cost(some)
         self._designs = find_method(state.method).designs
@@ -120,9 +119,7 @@ class Planner:
         if state.left is None:
             return None
         waiting = [t.action for t in state.trials if t.status == "pending"]
-        values = torch.stack(waiting) if waiting else limits.actions.listed()
-        if values is None:
-            values = limits.actions.sample((1_024,), seed=0)
+        values = torch.stack(waiting) if waiting else _listed_or_drawn(limits.actions)
         if bool(limits(values).any()):
             return None
         return (
@@ -290,9 +287,13 @@ def permitted(limits: DesignLimits) -> ActionSpace:
     return DiscreteActions(values, names=actions.names, units=actions.units)
 
 
-def most_unlike(
-    actions: ActionSpace, executed: Sequence[Tensor], num_draws: int = 1_024
-) -> ActionSpace:
+def _listed_or_drawn(actions: ActionSpace, num_draws: int = 1_024) -> Tensor:
+    """Return the actions of a list, or draws of a space without end."""
+    values = actions.listed()
+    return actions.sample((num_draws,), seed=0) if values is None else values
+
+
+def most_unlike(actions: ActionSpace, executed: Sequence[Tensor]) -> ActionSpace:
     r"""Return the permitted actions farthest from all executed ones.
 
     .. math::
@@ -304,7 +305,6 @@ def most_unlike(
     Args:
         actions: The permitted ones.
         executed: Executed actions, each of shape (action_dim,).
-        num_draws: Candidates of a space without end.
 
     References:
         Johnson, Moore & Ylvisaker, J. Stat. Plan. Inference 1990 (maximin distance).
@@ -316,9 +316,7 @@ def most_unlike(
     """
     if not executed:
         return actions
-    values = actions.listed()
-    if values is None:
-        values = actions.sample((num_draws,), seed=0)
+    values = _listed_or_drawn(actions)
     width = values.max(0).values - values.min(0).values
     width = torch.where(width > 0, width, torch.ones_like(width))
     places = torch.stack([*executed])

@@ -129,6 +129,11 @@ class PooledLearner(Learner):
             label = self._choice.label(trial.action[self._entry])
         return EmulatedTrial(self.simulated(trial.action), trial.x.float(), label)
 
+    def _spent(self, before: tuple[int, int] = (0, 0)) -> tuple[int, int]:
+        """Return the rows simulated since a count, and those that faults lost."""
+        len(self.pool)  # which brings back its rows
+        return self.state.meter.spent - before[0], self.pool.num_missing - before[1]
+
     def _add(self, theta: Tensor, action: Tensor, belief: Distribution) -> None:
         seed = derive_seed(self.state.seed, "pool", len(self.state.batches))
         self.pool.simulate(
@@ -166,7 +171,7 @@ class PooledLearner(Learner):
         seed = derive_seed(self.state.seed, "design", index)
         listed, notes = self._candidates(limits, seed)
         places, which = self.simulated(listed).unique(dim=0, return_inverse=True)
-        start, allowed = self.state.meter.spent, self._rows_left("design", index)
+        before, allowed = self._spent(), self._rows_left("design", index)
         half = allowed // 2
         if half < 1 and not len(self.state.batches):
             raise SimulationBudgetError(
@@ -189,6 +194,7 @@ class PooledLearner(Learner):
         eligible = limits.reached_by(shares)
         utility = (rows.mean(1) / limits.cost(listed)).masked_fill(~eligible, -math.inf)
         middle = rows.shape[1] // 2
+        num, missing = self._spent(before)
         return choose(
             limits,
             action=listed,
@@ -199,7 +205,8 @@ class PooledLearner(Learner):
             probability_valid=shares,
             estimator="PooledGain",
             bound="none",
-            num_simulations=self.state.meter.spent - start,
+            num_simulations=num,
+            num_missing=missing,
             stopped="budget spent",
             notes=(*notes, *limits.excluded_note(eligible)),
         )
@@ -273,14 +280,13 @@ class PooledLearner(Learner):
 
     def _score(self, trial: Trial, size: int = 2_000) -> tuple[float, float]:
         """Compare a trial with ``size`` predictions of the belief and the pool."""
-        state, start = self.state, self.state.meter.spent
-        own = self._trial(trial)
+        state, own, before = self.state, self._trial(trial), self._spent()
         self._require_rows([own], self._rows_left("belief", trial.index))
         emulation = self._emulation([own], 0, "score", trial.index)
         near, label = emulation.near, emulation.best_summary(own)
         fitted = emulation.alone(own, label)
         rng = np.random.default_rng(derive_seed(state.seed, "score", trial.index))
-        state.account(trial.index, state.meter.spent - start, 0)
+        state.account(trial.index, *self._spent(before))
         z = near[rng.integers(len(near), size=size)]
         if fitted.parts:
             drawn = torch.from_numpy(fitted.parts[0].draw(z, rng))
@@ -290,23 +296,16 @@ class PooledLearner(Learner):
             share = float(np.exp(outcome.log_prob(z)).mean())
         return (share if share < 0.5 else 1.0), math.log(share)
 
-    def _prepare(self, index: int) -> None:
-        pass  # there is no network
-
-    def _updated(self, trial: Trial) -> tuple[Any, int, int]:
-        state, start = self.state, self.state.meter.spent
-        trials = [*(t for t in state.explained if t.index != trial.index), trial]
-        belief = self._inferred(trials, trial.index)
-        return belief, state.meter.spent - start, self.pool.num_missing
-
     def _inferred(self, trials: Sequence[Trial], key: int) -> Any:
-        own = [self._trial(t) for t in trials]
-        index = trials[-1].index
-        allowed, start = self._rows_left("belief", index), self.state.meter.spent
+        own, before = [self._trial(t) for t in trials], self._spent()
+        allowed = self._rows_left("belief", trials[-1].index)
         self._require_rows(own, allowed)
-        allowed -= self.state.meter.spent - start
+        allowed -= self._spent(before)[0]
         emulation = self._emulation(own, max(allowed, 0), "belief", key)
         belief = emulation.run()
+        num, missing = self._spent(before)
+        known = {"num_simulations": num, "num_missing": missing}
+        belief.diagnostics = belief.diagnostics.extended(**known)
         if self._choice is not None:
             for trial, label in zip(trials, emulation.labels, strict=True):
                 self.state.change(trial.index, summary=label)

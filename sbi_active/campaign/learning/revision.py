@@ -98,27 +98,36 @@ def revise(state: CampaignState, actions: ActionSpace, report: Report) -> Learne
             f"expected a report of the current model, version {before.number}; got one "
             "of another; criticize() again"
         )
-    version = ModelVersion(
-        number=before.number + 1,
-        effects=(*names,),
-        digest=report.digest,
-        num_trials=len(state.measured),
-        trials=(*state.processed,),
+    state.versions.append(
+        ModelVersion(
+            number=before.number + 1,
+            effects=(*names,),
+            digest=report.digest,
+            num_trials=len(state.measured),
+            trials=(*state.processed,),
+        )
     )
-    state.versions.append(version)
     batches = [*state.batches]
     state.batches.clear()  # they are of another simulator
     try:
         revised = make_learner(report.simulator, report.prior, actions, state)
-        with state.watched(len(state.trials), "inference from all trials"):
-            misfit = revised.infer(state.measured)
+        _infer_at_once(state, revised)
     except BaseException:
         state.versions.pop()
         state.batches[:] = batches
         raise
-    state.versions[-1] = replace(version, misfit=misfit)
-    state.keep_draws(revised.belief)
     return revised
+
+
+def _infer_at_once(state: CampaignState, learner: Learner) -> None:
+    """Have the current model learn the trials before its adoption."""
+    version = state.version
+    before = [t for i in version.trials if (t := state.trials[i]).is_measured]
+    with state.watched(len(state.trials), "inference from all trials"):
+        misfit = learner.infer(before)
+    state.versions[-1] = replace(version, misfit=misfit)
+    state.processed[:] = version.trials
+    state.keep_draws(learner.belief)
 
 
 def require_effects(what: str, names: Sequence[str], effects: Sequence[Effect]) -> None:
@@ -180,18 +189,12 @@ def recompute(state: CampaignState, learner: Learner) -> None:
         learner: Learner of the current model; its belief is that of the adoption, or
             the prior.
     """
-    version = state.version
     state.processed.clear()
     state.draws.clear()
     for trial in state.trials:
         if trial.status != "pending":
             state.change(trial.index, **UNSCORED)
     learner.restart()
-    if version.trials:
-        before = [t for i in version.trials if (t := state.trials[i]).is_measured]
-        with state.watched(len(state.trials), "inference from all trials"):
-            misfit = learner.infer(before)
-        state.versions[-1] = replace(version, misfit=misfit)
-        state.processed.extend(version.trials)
-        state.keep_draws(learner.belief)
+    if state.version.trials:
+        _infer_at_once(state, learner)
     state.is_stale = False

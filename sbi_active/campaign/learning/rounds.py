@@ -75,25 +75,20 @@ class Round:
         learner, state = self._learner, self._learner.state
         if not self._is_trained:
             with state.stage(index, "simulation"):
-                rows, num_simulations, num_missing = self._rows(index)
+                rows = self._rows(index)
                 learner.inference.append_simulations(
                     rows.theta, rows.x, action=rows.action, belief=learner.belief
                 )
             own = forked_generators(state.seed, "train", len(state.explained))
             with state.stage(index, "training"), own:
                 learner.inference.train()
-            state.account(index, num_simulations, num_missing)
             self._is_trained = True
         return learner.inference.build_posterior()
 
-    def _rows(self, index: int) -> tuple[Simulations, int, int]:
+    def _rows(self, index: int) -> Simulations:
         """Simulate the round: parameters from the belief, actions from the space.
 
         The rows of a first round are stored with their density under the prior.
-
-        Returns:
-            Rows without the missing, how many were simulated, and how many of these
-            are missing.
         """
         learner, state = self._learner, self._learner.state
         # Not the index: a trial that was missing, or taken out, trains nothing.
@@ -112,7 +107,8 @@ class Round:
         rows = simulate(
             simulator, theta, action, seed=own, workers=workers, store=store
         )
-        return rows.without_missing(), len(rows), rows.counts["missing"]
+        state.account(index, len(rows), rows.counts["missing"])
+        return rows.without_missing()
 
 
 class RoundModel:

@@ -63,6 +63,8 @@ def made(name: str, state: Mapping[str, Any]) -> Any:
     for entry in getattr(kind, "__dataclass_fields__", {}).values():
         if entry.default_factory is not dataclasses.MISSING:
             instance.__dict__[entry.name] = entry.default_factory()
+    for entry in getattr(kind, "__attrs_attrs__", ()):  # options: all have one
+        instance.__dict__[entry.name] = entry.default
     instance.__dict__.update(state)
     return instance
 

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from attrs import field, frozen
 
-from sbi_active.expected import require, require_least, suggests
+from sbi_active.expected import at_least, at_most, of_class, suggests
 from sbi_active.simulation.workers.settings import IN_PROCESS, Workers
 
 
 @suggests
-@dataclass(frozen=True, kw_only=True)
+@frozen(kw_only=True, slots=False)
 class RefinementOptions:
     """Settings of the refinement.
 
@@ -23,9 +23,6 @@ class RefinementOptions:
             the power -1/2, in nats. Six times as many are taken while they are cheap,
             more of 12 parameters and more, and of a learned likelihood, whose draws
             cost no simulations, 16 times as many.
-        num_draws: Number of draws of each proposal of a simulated likelihood; None
-            takes a sixth of ``num_histories``, at least 100. Fewer reach a narrow
-            posterior in fewer simulations.
         defensive: Share of the prior in the belief, so that no parameter is ruled out
             by an error of the surrogate: a truth that it misses costs log(1 / share)
             nats and not infinitely many. Moments see the share too: .01 of a wide
@@ -34,14 +31,10 @@ class RefinementOptions:
             history of which a row stays lost is left out.
     """
 
-    num_histories: int = 3_000
-    num_effective: float = 200
-    num_draws: int | None = None
-    defensive: float = 1e-5
-    workers: Workers = IN_PROCESS
-
-    def __post_init__(self) -> None:
-        numbers = {"num_histories": 200, "num_effective": 20, "num_draws": 50}
-        require_least(self, "raise it", **numbers, defensive=1e-6)
-        share = self.defensive
-        require(share <= 0.5, "defensive <= 0.5", share, "use a small share")
+    num_histories: int = field(default=3_000, validator=at_least(200))
+    num_effective: float = field(default=200, validator=at_least(20))
+    defensive: float = field(
+        default=1e-5,
+        validator=[at_least(1e-6), at_most(0.5, "use a small share")],
+    )
+    workers: Workers = field(default=IN_PROCESS, validator=of_class(Workers))

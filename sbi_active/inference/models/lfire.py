@@ -3,22 +3,25 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 import torch
+from attrs import field, frozen
 from numpy.typing import NDArray
 from sklearn.linear_model import LogisticRegressionCV
 from torch import Tensor
 from torch.distributions import Distribution
 
-from sbi_active.expected import require, require_least
+from sbi_active.expected import at_least, require, suggests
 from sbi_active.inference.beliefs.belief import ParticleDraws
 from sbi_active.simulation.outcomes import Simulations
 
 
-@dataclass(frozen=True, kw_only=True)
+@suggests
+@frozen(kw_only=True, slots=False)
 class LFIRE:
     r"""Settings of a penalized logistic regression a parameter set.
 
@@ -27,15 +30,11 @@ class LFIRE:
         \beta_\theta^\top \psi(x) + \beta_{\theta, 0}
 
     separates outcomes at :math:`\theta` from outcomes of the marginal, both kinds
-    weighing alike; a ridge penalty is chosen by cross-validated log loss.
+    weighing alike; :math:`\psi` is each number and its square, and a ridge penalty is
+    chosen by cross-validated log loss.
 
     Attributes:
-        summary: :math:`\psi`, outcomes (n, *x_shape) to summaries (n, q); None takes
-            ``powers`` of each number.
-        powers: Exponents.
         num_marginal: Rows of the marginal in one regression, at most.
-        num_penalties: Strengths to choose from, 0.1 to 10,000 inverse.
-        num_folds: Number of folds of the cross-validation.
 
     References:
         Thomas, Dutta, Corander, Kaski & Gutmann, Bayesian Analysis 2022, who take a
@@ -43,30 +42,22 @@ class LFIRE:
         tenth.
     """
 
-    summary: Callable[[Tensor], Tensor] | None = None
-    powers: tuple[int, ...] = (1, 2)
-    num_marginal: int = 500
-    num_penalties: int = 4
-    num_folds: int = 3
-
-    def __post_init__(self) -> None:
-        require_least(self, "raise it", num_marginal=10, num_penalties=1, num_folds=2)
+    num_marginal: int = field(default=500, validator=at_least(10))
+    #: Parts of the cross-validation.
+    num_folds: ClassVar[int] = 3
 
     def summaries(self, x: Tensor, center: Tensor, scale: Tensor) -> Tensor:
         """Return summaries, and whether there was a measurement, shape (n, q + 1).
 
         Args:
             x: Outcomes, shape (n, *x_shape); NaN where there was no measurement.
-            center: Subtracted from the numbers before powers are taken, (x_dim,).
+            center: Subtracted from the numbers before squares are taken, (x_dim,).
             scale: Scale by which they are divided, shape (x_dim,).
         """
         flat = x.double().flatten(1)
         valid = flat.isfinite().all(1, keepdim=True)
-        if self.summary is not None:
-            psi = self.summary(x).double()
-        else:
-            z = (flat - center) / scale
-            psi = torch.cat([z**power for power in self.powers], 1)
+        z = (flat - center) / scale
+        psi = torch.cat([z, z**2], 1)
         return torch.cat([torch.where(valid, psi, 0.0), valid.double()], 1)
 
     def fit(
@@ -96,7 +87,7 @@ class LFIRE:
         label = np.repeat([1, 0], [len(own), len(marginal)])
         order = np.random.default_rng(seed).permutation(len(label))
         model = LogisticRegressionCV(
-            Cs=np.logspace(-1, 4, self.num_penalties),  # pyright: ignore
+            Cs=np.logspace(-1, 4, 4),  # pyright: ignore
             cv=self.num_folds,
             scoring="neg_log_loss",
             solver="newton-cholesky",

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import math
 import warnings
-from dataclasses import replace
 
 import torch
+from attrs import evolve
 from sbi.neural_nets.estimators.base import ConditionalDensityEstimator
 from sklearn.neural_network import MLPClassifier
 from torch import Tensor, nn
@@ -71,7 +71,7 @@ class LikelihoodNetwork(ConditionalDensityEstimator):
         residual, _ = self._standardize(x[valid].double(), condition[valid])
         seen = self._see(condition)
         # The action's place matters to the regression alone.
-        plain = replace(settings, details=replace(settings.details, baseline="none"))
+        plain = evolve(settings, details=evolve(settings.details, baseline="none"))
         self.mixture = plain(residual.float(), seen[valid])
         self.validity: MLPClassifier | None = None
         if not bool(valid.all()):

@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 import time
 from collections.abc import Callable
 from copy import deepcopy
-from dataclasses import dataclass, field
 from typing import Any, Literal
 
 import torch
+from attrs import field, frozen
 from torch import Tensor, nn
 from torch.nn.utils import clip_grad_norm_
 
-from sbi_active.expected import require, require_least, require_one_of, suggests
+from sbi_active.expected import at_least, of_class, one_of, positive, suggests
 from sbi_active.inference.networks.mixture_network import (
     ACTIVATIONS,
     MixtureDensityNetwork,
@@ -23,7 +24,7 @@ from sbi_active.renamed import takes_loose
 
 
 @suggests
-@dataclass(frozen=True, kw_only=True)
+@frozen(kw_only=True, slots=False)
 class MixtureDetails:
     """Settings of the mixture density network that few change.
 
@@ -39,17 +40,15 @@ class MixtureDetails:
             standardizes each number over all rows alone.
     """
 
-    batch_size: int = 200
-    learning_rate: float = 1.5e-2
-    activation: Literal["silu", "relu"] = "silu"
-    anneal: bool = True
-    baseline: Literal["best", "none"] = "best"
-
-    def __post_init__(self) -> None:
-        require_least(self, "raise it", batch_size=1)
-        rate = self.learning_rate
-        require(rate > 0, "learning_rate > 0", rate, "use 1e-3")
-        require_one_of(self, activation=ACTIVATIONS, baseline=("best", "none"))
+    batch_size: int = field(default=200, validator=at_least(1))
+    learning_rate: float = field(default=1.5e-2, validator=positive("use 1e-3"))
+    activation: Literal["silu", "relu"] = field(
+        default="silu", validator=one_of(*ACTIVATIONS)
+    )
+    anneal: bool = field(default=True, validator=of_class(bool))
+    baseline: Literal["best", "none"] = field(
+        default="best", validator=one_of("best", "none")
+    )
 
 
 #: Number of epochs that sbi's own default allows.
@@ -59,7 +58,7 @@ GROUPS = {"details": MixtureDetails}
 
 
 @takes_loose(**GROUPS)
-@dataclass(frozen=True, kw_only=True)
+@frozen(kw_only=True, slots=False)
 class MixtureDensity:
     """Settings of the mixture density network.
 
@@ -88,15 +87,13 @@ class MixtureDensity:
         torch.Size([3])
     """
 
-    hidden_features: tuple[int, ...] = (128, 128)
-    num_components: int = 8
-    num_iterations: int = 160
+    hidden_features: tuple[int, ...] = field(default=(128, 128), validator=at_least(1))
+    num_components: int = field(default=8, validator=at_least(1))
+    num_iterations: int = field(default=160, validator=at_least(1))
     embedding_net: nn.Module | None = None
-    details: MixtureDetails = MixtureDetails()
-
-    def __post_init__(self) -> None:
-        names = ("num_components", "num_iterations", "hidden_features")
-        require_least(self, "raise it", **dict.fromkeys(names, 1))
+    details: MixtureDetails = field(
+        default=MixtureDetails(), validator=of_class(MixtureDetails)
+    )
 
     @classmethod
     def faithful(cls) -> MixtureDensity:
@@ -150,13 +147,13 @@ class MixtureDensity:
         return MixtureDensityNetwork(theta, condition, action_dim, self)
 
 
-@dataclass
+@dataclasses.dataclass
 class TrainingRecord:
     """Losses and durations, one an epoch."""
 
-    training_loss: list[float] = field(default_factory=list)
-    validation_loss: list[float] = field(default_factory=list)
-    seconds: list[float] = field(default_factory=list)
+    training_loss: list[float] = dataclasses.field(default_factory=list)
+    validation_loss: list[float] = dataclasses.field(default_factory=list)
+    seconds: list[float] = dataclasses.field(default_factory=list)
 
 
 def train_network(

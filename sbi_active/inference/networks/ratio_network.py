@@ -2,52 +2,41 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import torch
+from attrs import field, frozen
 from sbi.neural_nets.ratio_estimators import RatioEstimator
 from torch import Tensor, nn
 
-from sbi_active.expected import require, require_least
+from sbi_active.expected import at_least, suggests
 from sbi_active.inference.networks.conditioning import Whitening, can_regress, moments
 from sbi_active.inference.networks.mixture_network import layers
 from sbi_active.inference.networks.response import Response
 
 
-@dataclass(frozen=True, kw_only=True)
+@suggests
+@frozen(kw_only=True, slots=False)
 class RatioClassifier:
     """Settings of the classifier that gives the log ratio, and of its training.
 
     Attributes:
         hidden_features: Width of each hidden layer.
-        batch_size: Rows a step.
-        learning_rate: Learning rate of Adam.
         num_iterations: Steps of stochastic gradient descent, at most.
-        stop_after_epochs: Epochs without improvement on held-out rows that end it.
     """
 
-    hidden_features: tuple[int, ...] = (64, 64)
-    batch_size: int = 200
-    learning_rate: float = 2e-3
-    num_iterations: int = 400
-    stop_after_epochs: int = 20
+    hidden_features: tuple[int, ...] = field(default=(64, 64), validator=at_least(1))
+    num_iterations: int = field(default=400, validator=at_least(1))
     anneal: ClassVar[bool] = False
 
     @property
     def training(self) -> dict[str, Any]:
-        """Arguments of sbi's ``train``."""
+        """Arguments of sbi's ``train``; its patience is sbi's own."""
         return {
-            "training_batch_size": self.batch_size,
-            "learning_rate": self.learning_rate,
-            "stop_after_epochs": self.stop_after_epochs,
+            "training_batch_size": 200,
+            "learning_rate": 2e-3,
+            "stop_after_epochs": 20,
         }
-
-    def __post_init__(self) -> None:
-        names = ("hidden_features", "batch_size", "num_iterations", "stop_after_epochs")
-        require_least(self, "raise it", **dict.fromkeys(names, 1))
-        rate = self.learning_rate
-        require(rate > 0, "learning_rate > 0", rate, "use 1e-3")
 
 
 class RatioNetwork(RatioEstimator):

@@ -2,13 +2,26 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from numbers import Real
+from typing import Any
 
-from sbi_active.expected import require, require_least, suggests
+from attrs import field, frozen
+
+from sbi_active.expected import at_least, positive, require, suggests
+
+
+def _is_number_of_workers(settings: Any, attribute: Any, value: Any) -> None:
+    is_number = isinstance(value, Real)
+    require(
+        is_number and (float(value) >= 1 or value == -1),
+        "num_workers >= 1, or -1 for one a core",
+        repr(value),
+        "use 1 to simulate in this process",
+    )
 
 
 @suggests
-@dataclass(frozen=True)
+@frozen(slots=False)
 class Workers:
     """Workers that run simulations, and the cost of a row; x does not depend on them.
 
@@ -25,24 +38,11 @@ class Workers:
         ValueError: If a number is out of its range.
     """
 
-    num_workers: int = 1
-    time_limit: float | None = None
-    num_retries: int = 0
-
-    def __post_init__(self) -> None:
-        require(
-            self.num_workers >= 1 or self.num_workers == -1,
-            "num_workers >= 1, or -1 for one a core",
-            self.num_workers,
-            "use 1 to simulate in this process",
-        )
-        require(
-            self.time_limit is None or self.time_limit > 0,
-            "time_limit > 0 s a row",
-            self.time_limit,
-            "use None to wait for ever",
-        )
-        require_least(self, "use 0 to try once", num_retries=0)
+    num_workers: int = field(default=1, validator=_is_number_of_workers)
+    time_limit: float | None = field(
+        default=None, validator=positive("use None to wait for ever")
+    )
+    num_retries: int = field(default=0, validator=at_least(0, "use 0 to try once"))
 
     @classmethod
     def of(cls, workers: Workers | int | None) -> Workers:

@@ -1,11 +1,11 @@
 """Every method of a campaign, through the same protocol."""
 
 import warnings
-from dataclasses import replace
 
 import cloudpickle
 import pytest
 import torch
+from attrs import evolve
 
 from sbi_active import MixtureDensity
 from sbi_active.campaign.learning.methods import METHODS
@@ -15,7 +15,7 @@ from tests.campaign.sizes import REFINEMENT
 
 DENSITY = MixtureDensity(hidden_features=(16,), num_components=2, num_iterations=150)
 TRAINED = {**dict.fromkeys(("asbi", "nsbi", "alhi", "nlhi"), DENSITY), "seqbed": RATIOS}
-FEW = replace(RATIOS, num_iterations=5)
+FEW = evolve(RATIOS, num_iterations=5)
 QUICK = {**dict.fromkeys(TRAINED, OPTIONS.density_estimator), "seqbed": FEW}
 GAINS = {"asbi": "posterior", "alhi": "likelihood", "seqbed": "ratio"}
 

@@ -1,9 +1,8 @@
 """What a campaign's next trial is for, when it stops, and adopting another model."""
 
-from dataclasses import replace
-
 import pytest
 import torch
+from attrs import evolve
 from sbi.utils import BoxUniform
 
 from sbi_active import (
@@ -25,7 +24,7 @@ MODEL = SimulatorModel(
     noise=GaussianNoise(0.1),
     parameter_names=["slope"],
 )
-OPTIONS = replace(problem.OPTIONS, details=CampaignDetails(num_scored=400))
+OPTIONS = evolve(problem.OPTIONS, details=CampaignDetails(num_scored=400))
 SHIFT = 0.8
 
 
@@ -36,7 +35,7 @@ LIBRARY = [BIAS, DRIFT]
 
 
 def campaign(effects=(BIAS,), method="asbi", *, constraint=None, **changes):
-    options = replace(OPTIONS, **changes)
+    options = evolve(OPTIONS, **changes)
     given = {"effects": effects, "constraint": constraint, "options": options}
     return Campaign(MODEL, PRIOR, ACTIONS, method=method, **given)
 
@@ -99,7 +98,7 @@ def test_a_report_of_another_model_is_refused(adopted):
 
 
 def test_every_second_trial_may_go_where_none_was():
-    c = Campaign(MODEL, PRIOR, ACTIONS, options=replace(OPTIONS, check_every=2))
+    c = Campaign(MODEL, PRIOR, ACTIONS, options=evolve(OPTIONS, check_every=2))
     actions = []
     for _ in range(4):
         actions.append(float(c.ask().action))

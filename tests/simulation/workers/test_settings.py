@@ -1,15 +1,20 @@
-"""The workers as one value."""
+"""Workers and other options, as values."""
 
-from dataclasses import replace
+import copy
+import pickle
 from functools import partial
 from typing import Any
 
 import pytest
 import torch
+from attrs import evolve
 
-from sbi_active import CampaignOptions, simulate
-from sbi_active.campaign.options import CampaignDetails
-from sbi_active.campaign.storage.codec import decode, encode
+from sbi_active import CampaignOptions, MixtureDensity, simulate
+from sbi_active.campaign.options import CampaignDetails, StopRules
+from sbi_active.campaign.storage.codec import decode, encode, made
+from sbi_active.inference import LFIRE, RefinementOptions
+from sbi_active.inference.networks.mixture_density import MixtureDetails
+from sbi_active.inference.networks.ratio_network import RatioClassifier
 from sbi_active.messages import RenamedWarning
 from sbi_active.migration.described import options_from
 from sbi_active.simulation import Workers
@@ -28,7 +33,7 @@ def test_a_simulation_takes_them_as_one_value_or_their_number():
     simulator = partial(fails, times=2, attempts=[])
     assert simulate(simulator, *ROWS, seed=0, workers=Workers(1, None, 2)).x == 2
     assert simulate(torch.add, *ROWS, seed=0, workers=1).x == 2
-    assert CampaignOptions(workers=2).workers == Workers(2)  # pyright: ignore
+    assert CampaignOptions(workers=2).workers == Workers(2)
 
 
 def test_former_options_of_a_campaign_are_taken_for_one_version():
@@ -40,7 +45,7 @@ def test_former_options_of_a_campaign_are_taken_for_one_version():
     assert options.workers == Workers(2, 9.0)
     assert options.details == CampaignDetails(num_scored=200)
     assert CampaignOptions.of({**former, "num_samples": 10}) == options
-    assert replace(options, eliminate=False).details.num_scored == 200
+    assert evolve(options, eliminate=False).details.num_scored == 200
     assert options.num_scored == 200
     with pytest.raises(AttributeError, match="num_rows"):
         _ = options.num_rows
@@ -52,3 +57,99 @@ def test_former_options_of_a_campaign_are_taken_for_one_version():
     loaded = object.__new__(CampaignOptions)
     loaded.__setstate__({**state, **former})
     assert loaded == options
+
+
+@pytest.mark.parametrize(
+    ("options", "shown", "name"),
+    [
+        (Workers(2, 9.0), "num_workers=2, time_limit=9.0, num_retries=0", "num_worker"),
+        (
+            StopRules(max_sd=[1, 2]),
+            "min_information_gain=None, max_sd=(1.0, 2.0), budget=None",
+            "max_sds",
+        ),
+        (
+            CampaignDetails(look_ahead=1),
+            "posterior='importance', eliminate=True, num_scored=2000, look_ahead=1",
+            "num_score",
+        ),
+        (
+            RefinementOptions(num_histories=500),
+            "num_histories=500, num_effective=200, defensive=1e-05, workers=Workers("
+            "num_workers=1, time_limit=None, num_retries=0)",
+            "num_history",
+        ),
+        (
+            RatioClassifier(hidden_features=(8,)),
+            "hidden_features=(8,), num_iterations=400",
+            "hidden_feature",
+        ),
+        (LFIRE(num_marginal=50), "num_marginal=50", "num_marginals"),
+        (CampaignOptions(workers=3), None, "num_sample"),
+        (MixtureDensity.faithful(), None, "num_iteration"),
+        (MixtureDetails(batch_size=7), None, "batch_sizes"),
+    ],
+)
+def test_options_are_values(options, shown, name):
+    kind = type(options)
+    same = [
+        *(evolve(options), pickle.loads(pickle.dumps(options))),
+        *(copy.copy(options), copy.deepcopy(options)),
+        *(decode(encode(options, known={}), known={}), eval_of(options)),
+    ]
+    for other in same:
+        assert other == options
+        assert hash(other) == hash(options)
+    assert options != kind()
+    assert shown is None or repr(options) == f"{kind.__name__}({shown})"
+    with pytest.raises(AttributeError):
+        setattr(options, next(iter(vars(options))), 3)
+    with pytest.raises(TypeError, match=f"got '{name}'; did you mean"):
+        kind(**{name: 3})
+    with pytest.raises(TypeError, match=f"got '{name}'; did you mean"):
+        evolve(options, **{name: 3})
+
+
+def eval_of(options):
+    """Return what the repr makes."""
+    kinds = (Workers, StopRules, CampaignDetails, RefinementOptions, CampaignOptions)
+    networks = (RatioClassifier, LFIRE, MixtureDensity, MixtureDetails)
+    return eval(repr(options), {kind.__name__: kind for kind in (*kinds, *networks)})
+
+
+def test_what_was_stored_before_an_option_came_has_its_default():
+    name = "sbi_active.campaign.options:CampaignDetails"
+    assert made(name, {"num_scored": 200}) == CampaignDetails(num_scored=200)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "expected"),
+    [
+        ({"num_workers": 0}, "num_workers >= 1, or -1 for one a core; got 0"),
+        ({"num_workers": "two"}, "num_workers >= 1, or -1 for one a core; got 'two'"),
+        ({"time_limit": 0.0}, "time_limit > 0 or None; got 0.0; use None to wait"),
+        ({"num_retries": -1}, "num_retries >= 0; got -1; use 0 to try once"),
+    ],
+)
+def test_workers_that_cannot_be_are_refused(wrong, expected):
+    with pytest.raises(ValueError, match=f"expected {expected}"):
+        Workers(**wrong)
+
+
+@pytest.mark.parametrize(
+    ("kind", "wrong", "expected"),
+    [
+        (RefinementOptions, {"defensive": 0.6}, "defensive <= 0.5; got 0.6"),
+        (RefinementOptions, {"defensive": 0}, "defensive >= 1e-06; got 0"),
+        (RefinementOptions, {"workers": 2}, "workers of class Workers; got 2"),
+        (MixtureDensity, {"hidden_features": (8, 0)}, "hidden_features >= 1; got 0"),
+        (MixtureDensity, {"details": 3}, "details of class MixtureDetails; got 3"),
+        (MixtureDetails, {"learning_rate": 0}, "learning_rate > 0; got 0; use 1e-3"),
+        (MixtureDetails, {"activation": "tanh"}, "activation among 'silu', 'relu'"),
+        (RatioClassifier, {"num_iterations": 0}, "num_iterations >= 1; got 0"),
+        (LFIRE, {"num_marginal": 9}, "num_marginal >= 10; got 9"),
+    ],
+)
+def test_settings_that_cannot_be_are_refused(kind, wrong, expected):
+    with pytest.raises((ValueError, TypeError), match=f"expected {expected}"):
+        kind(**wrong)
