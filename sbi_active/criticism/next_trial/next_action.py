@@ -14,8 +14,8 @@ from sbi_active.arrays import Array
 from sbi_active.criticism.evidence.rival_set import RivalSet
 from sbi_active.criticism.next_trial.candidates import (
     PLAN,
+    beyond_range,
     following,
-    outside_candidates,
     permitted_candidates,
     simulated,
 )
@@ -95,7 +95,7 @@ class PredictedRival:
 
 
 def choose_action(
-    rivals: RivalSet, tracing: Tracing, actions: ActionSpace, *, beyond: bool = True
+    rivals: RivalSet, tracing: Tracing, actions: ActionSpace, *, outside: bool = True
 ) -> NextAction:
     r"""Return the action of the largest information about the model index.
 
@@ -111,7 +111,7 @@ def choose_action(
         rivals: The models.
         tracing: Tracing with their probabilities.
         actions: The permitted ones.
-        beyond: Whether to try others where these separate nothing.
+        outside: Whether to try others where these separate nothing.
     """
     candidates = permitted_candidates(rivals, actions)
     own, misfit = _Choosing(rivals, tracing), tracing.misfit
@@ -134,9 +134,9 @@ def choose_action(
         groups.append(frozenset(named))
     groups = [g for g in dict.fromkeys(groups) if len(g) > 1]
     found = replace(found, inseparable=(*groups,))
-    if not beyond or not groups:
+    if not outside or not groups:
         return found
-    others = outside_candidates(actions, candidates, limit=PLAN.max_outside)
+    others = beyond_range(actions, candidates, limit=PLAN.max_outside, mirrored=True)
     return own.look_outside(found, simulated(rivals, others))
 
 
