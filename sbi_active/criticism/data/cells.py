@@ -12,8 +12,7 @@ import numpy as np
 import pandas as pd
 
 from sbi_active.arrays import Array
-from sbi_active.criticism.data.columns import TRIAL, Column
-from sbi_active.criticism.data.units import TIME
+from sbi_active.criticism.data.columns import TIME, TRIAL, Column
 from sbi_active.expected import require
 
 EMPTY = ("", "nan", "none", "na", "<na>", "nat")

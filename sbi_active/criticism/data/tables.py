@@ -20,13 +20,14 @@ import pandas as pd
 from sbi_active.arrays import Array
 from sbi_active.criticism.data.cells import Cells, read_csv
 from sbi_active.criticism.data.columns import (
+    TIME,
     TRIAL,
     Told,
     as_list,
     find_columns,
     require_columns,
+    split,
 )
-from sbi_active.criticism.data.units import TIME, split
 from sbi_active.expected import require
 from sbi_active.messages import warn
 

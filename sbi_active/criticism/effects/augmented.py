@@ -18,8 +18,7 @@ from sbi_active.criticism.effects.application import (
     nulls,
     require_positive,
 )
-from sbi_active.criticism.effects.declarations import require_distinct
-from sbi_active.criticism.effects.effect import Context, Effect
+from sbi_active.criticism.effects.effect import Context, Effect, require_distinct
 from sbi_active.expected import require
 from sbi_active.seeding import forked_generators, row_seeds
 from sbi_active.simulation import SimulatorModel

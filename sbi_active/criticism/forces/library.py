@@ -16,7 +16,7 @@ from sbi_active.arrays import Array
 from sbi_active.criticism.data.trials import Trials
 from sbi_active.criticism.effects.augmented import AugmentedSimulator
 from sbi_active.criticism.effects.effect import Context, Effect, UnderKey
-from sbi_active.criticism.effects.patterns import picked
+from sbi_active.criticism.effects.table import picked
 from sbi_active.criticism.forces.dictionary import (
     FORMS,
     FREE,

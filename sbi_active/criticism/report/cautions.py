@@ -13,13 +13,13 @@ from sbi_active.criticism.effects.effect import Effect
 from sbi_active.criticism.evidence.rival_set import FEW_TRIALS
 from sbi_active.criticism.forces.library import COUPLING, FAMILY
 from sbi_active.criticism.report.contents import Contents
-from sbi_active.criticism.report.summary import (
+from sbi_active.criticism.report.words import (
     NO_PART,
+    blocks,
     narrow_prior,
     rests,
     suspects_in_words,
 )
-from sbi_active.criticism.report.words import blocks
 from sbi_active.criticism.results import (
     FEW_DRAWS,
     NONE,

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sbi_active.criticism.report.contents import Contents
-from sbi_active.criticism.report.summary import added
+from sbi_active.criticism.report.words import added
 from sbi_active.criticism.results import Array, Evaluation, Residuals, Tracing
 
 if TYPE_CHECKING:

@@ -11,7 +11,7 @@ import torch
 from sbi_active.criticism.data.trials import Trials
 from sbi_active.criticism.effects.augmented import AugmentedSimulator
 from sbi_active.criticism.effects.effect import Context, Effect
-from sbi_active.criticism.effects.patterns import picked
+from sbi_active.criticism.effects.table import picked
 from sbi_active.expected import suggests
 from sbi_active.mujoco.effects.changes import QuantityChange
 from sbi_active.mujoco.effects.elements import elements

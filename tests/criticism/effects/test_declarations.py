@@ -21,7 +21,7 @@ from sbi_active.criticism import (
     generic_effects,
     joint_prior,
 )
-from sbi_active.criticism.effects.declarations import require_nested
+from sbi_active.criticism.effects.effect import require_nested
 from tests.effects import effect
 
 NAN, NORMAL = float("nan"), Normal(0.0, 1.0)
