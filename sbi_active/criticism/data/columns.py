@@ -14,12 +14,12 @@ from dataclasses import dataclass
 from sbi_active.expected import did_you_mean, require
 
 TIME = "time"
-PREFIXES = {"": 1.0, "k": 1e3, "c": 1e-2, "m": 1e-3, "u": 1e-6, "µ": 1e-6, "n": 1e-9}
+SCALES = {"": 1.0, "k": 1e3, "c": 1e-2, "m": 1e-3, "u": 1e-6, "µ": 1e-6, "n": 1e-9}
 BASES = {b: b for b in ("m", "s", "N", "V", "A", "W", "J", "Hz", "Pa", "rad")}
 #: Factor and SI unit of each word; "g" and "mg" are masses or accelerations, and not
 #: among them.
-WORDS = {p + b: (f, s) for p, f in PREFIXES.items() for b, s in BASES.items()} | {
-    **{f"{p}Nm": (f, "N m") for p, f in PREFIXES.items()},
+WORDS = {p + b: (f, s) for p, f in SCALES.items() for b, s in BASES.items()} | {
+    **{f"{p}Nm": (f, "N m") for p, f in SCALES.items()},
     **dict.fromkeys(("deg", "°", "degree", "degrees"), (math.pi / 180, "rad")),
     **dict.fromkeys(("rev", "turn", "turns"), (2 * math.pi, "rad")),
     "rpm": (math.pi / 30, "rad/s"),
