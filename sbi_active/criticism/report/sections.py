@@ -203,8 +203,6 @@ def cautions_with_codes(report: Contents) -> list[tuple[str, str]]:
 def _pictures(report: Contents) -> dict[str, Picture]:
     """Return the places of the figures by the titles of their sections."""
     names = {"Residuals": "residuals"}
-    if report.has_probabilities:
-        names["Effects"] = "probabilities"
     if report.evaluation is not None:
         names["Error before and after"] = "before_after"
     return {t: Picture(n, CAPTIONS[n], CAPTIONS[n]) for t, n in names.items()}
