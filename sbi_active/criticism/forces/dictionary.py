@@ -125,8 +125,7 @@ class Joint:
 
     Attributes:
         name: Name in reports.
-        place: Place among the positions.
-        dof: Place among the velocities.
+        dof: Place among the positions, and the velocities.
         unit: Unit of a force on it, "N" or "N m".
         position: Unit of q.
         velocity: Unit of v.
@@ -135,7 +134,6 @@ class Joint:
     """
 
     name: str
-    place: int
     dof: int
     unit: str
     position: float
@@ -180,7 +178,7 @@ class FormForce:
     def values(self, q: Array, v: Array, t: float, trial: Array) -> Array:
         """Return the form's functions, shape (n, k)."""
         own = self.other or self.joint
-        at = q[:, own.place] / own.position
+        at = q[:, own.dof] / own.position
         speed = v[:, own.dof] / own.velocity
         time = t / self.horizon
         if not self.form.startswith("free"):

@@ -25,7 +25,7 @@ from torch import Tensor
 from sbi_active.actions import ActionSpace
 from sbi_active.criticism.contradictions import SevereTest
 from sbi_active.criticism.evidence.rival_set import RivalSet
-from sbi_active.criticism.next_trial.candidates import (
+from sbi_active.criticism.next_trial.next_action import (
     PLAN,
     beyond_range,
     following,

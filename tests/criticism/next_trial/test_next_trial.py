@@ -12,8 +12,11 @@ from torch.distributions import Normal
 from sbi_active import DiscreteActions, GaussianNoise, SimulatorModel
 from sbi_active.criticism import Criticism, Trials
 from sbi_active.criticism.next_trial import next_action
-from sbi_active.criticism.next_trial.candidates import beyond_range
-from sbi_active.criticism.next_trial.next_action import PredictedRival, choose_action
+from sbi_active.criticism.next_trial.next_action import (
+    PredictedRival,
+    beyond_range,
+    choose_action,
+)
 from sbi_active.criticism.results import ModelKey
 from sbi_active.design.estimators.model_index import ModelIndexGain, RivalSampler
 from tests.criticism.misfit.oscillator import ACTION, EFFECTS, trials
