@@ -80,7 +80,7 @@ class Cells:
             for now, then, row in zip(time, before["time"], before["row"], strict=True)
         ]
         advice = "sort its rows, remove what is there twice, or give each trial its own"
-        increases = ~(time <= before["time"]).to_numpy()
+        increases = ~(time <= before["time"].to_numpy())
         expected = "times that increase within a trial"
         self.require(increases, column, expected, said, f"{advice} name")
         return time
