@@ -242,8 +242,8 @@ def _samples(cells: Cells, x: Array) -> list[Array]:
         cells: Rows of the trials.
         x: Numbers of each row, shape (n, k).
     """
-    filled: Array = np.isfinite(x).any(1)
-    given: Array = np.isfinite(_columns(cells, "input")).any(1)
+    filled: Any = np.isfinite(x).any(1)
+    given: Any = np.isfinite(_columns(cells, "input")).any(1)
     members = cells.members
     if cells.columns["input"]:
         if len(lost := np.flatnonzero(filled & ~given)):
