@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -57,7 +57,9 @@ class Cells:
         self.first = np.array([at[0] for at in self.members], dtype=int)
         for column in columns[TRIAL]:
             told = self.words(column)
-            self.require(told != "", column, "the name of a trial", told, "fill it in")
+            self.require(
+                told != "", column, "the name of a trial", lambda _: "", "fill it in"
+            )
 
     @cached_property
     def time(self) -> Array:
@@ -68,17 +70,18 @@ class Cells:
         cells: Any = self.frame[column.header]
         if cells.dtype.kind in "mM":  # dates are told from the start of each trial
             told = cells.notna().to_numpy()
-            self.require(told, column, "a time", cells, "fill it in")
+            self.require(told, column, "a time", lambda i: cells[i], "fill it in")
             start = cells.groupby(self.trial).transform("first")
             time = (cells - start).dt.total_seconds().to_numpy(float)
         else:
             time = self.numbers(column)
-        rows = pd.DataFrame({"time": time, "row": self.frame.index})
+        rows = pd.DataFrame({"time": time, "row": [row + 1 for _, row in self._places]})
         before = rows.groupby(self.trial).shift()
-        said = [
-            f"{now:g} s after {then:g} s of row {row + 1:.0f}"
-            for now, then, row in zip(time, before["time"], before["row"], strict=True)
-        ]
+
+        def said(i: int) -> str:
+            then, row = before.loc[i]
+            return f"{time[i]:g} s after {then:g} s of row {row:.0f}"
+
         advice = "sort its rows, remove what is there twice, or give each trial its own"
         increases = ~(time <= before["time"].to_numpy())
         expected = "times that increase within a trial"
@@ -89,23 +92,21 @@ class Cells:
         """Return a column as numbers in SI, (n,), NaN where cells may be empty."""
         cells: Any = self.frame[column.header]
         text = cells.map(lambda cell: str(cell).strip())
-        given = cells if cells.dtype.kind in "iuf" else text
+        given = cells if cells.dtype.kind in "biuf" else text
         parsed: Any = pd.to_numeric(given, errors="coerce")
         values = parsed.to_numpy(dtype=float, na_value=np.nan) * column.factor
         is_empty = text.str.lower().isin(EMPTY).to_numpy()
         is_number = np.abs(values) <= np.finfo(np.float32).max
-        advice = "write decimals with a point and the unit in the header, as in name"
-        advice += f"[unit], and {'leave what was not measured empty' * empty}"
-        self.require(
-            is_number | (is_empty & empty),
-            column,
-            "a finite number",
-            [
-                cell if gap else repr(cell)
-                for cell, gap in zip(text, is_empty, strict=True)
-            ],
-            f"{advice}{'fill it in' * (not empty)}",
+        advice = "write decimals with a point and the unit in the header, as name[unit]"
+        advice += (
+            ", and leave what was not measured empty" if empty else ", and fill it in"
         )
+        holds = is_number | (is_empty & empty)
+
+        def said(i: int) -> str:
+            return text[i] if is_empty[i] else repr(text[i])
+
+        self.require(holds, column, "a finite number", said, advice)
         return values
 
     def words(self, column: Column) -> Array:
@@ -124,7 +125,7 @@ class Cells:
             values == own[self.trial],
             column,
             "one value in each trial",
-            [f"{a} after {b}" for a, b in zip(values, own[self.trial], strict=True)],
+            lambda i: f"{values[i]} after {own[self.trial[i]]}",
             "call it input_* if it is commanded over time and x_* if it is measured, "
             "give a start_* its value at the start in each row, or give each trial its "
             "own name",
@@ -136,7 +137,7 @@ class Cells:
         holds: Array,
         column: Column,
         expected: str,
-        got: Sequence[object] | pd.Series | Array,
+        got: Callable[[int], object],
         advice: str,
     ) -> None:
         """Raise at the first row at which something does not hold.
@@ -145,12 +146,12 @@ class Cells:
             holds: Whether it holds, shape (n,).
             column: Column of the cells.
             expected: Description of a right cell.
-            got: Cells in words, one a row.
+            got: Function that gives a cell in words.
             advice: Advice on what to do.
         """
         for i in np.flatnonzero(~holds)[:1].tolist():
             where = f"{expected} in column {column.header}, {self.place(i)}"
-            said = f"{[*got][i] if str([*got][i]) else 'an empty cell'}"
+            said = str(got(i)) or "an empty cell"
             require(False, where, f"{said} in {self._places[i][0]}", advice)
 
     def place(self, i: Any) -> str:

@@ -215,7 +215,9 @@ def arguments_of(cells: Cells, beside: Cells | None = None) -> dict[str, Any]:
         roles = cells.words(column)
         is_role = np.isin(roles.astype(str), ("", "fit", "held out", "held_out"))
         advice = "write one of them, or leave it empty for fit"
-        cells.require(is_role, column, "a role 'fit' or 'held out'", roles, advice)
+        cells.require(
+            is_role, column, "a role 'fit' or 'held out'", roles.__getitem__, advice
+        )
         found["role"] = [role or "fit" for role in cells.constant(column, roles)]
     for column in columns["repeat_of"]:
         cells.constant(column, cells.words(column))
@@ -223,7 +225,7 @@ def arguments_of(cells: Cells, beside: Cells | None = None) -> dict[str, Any]:
         is_known = ~(repeated >= 0) | np.isin(repeated, index)
         advice = "give that of the first trial of this action"
         expected = "an index of the table"
-        cells.require(is_known, column, expected, repeated, advice)
+        cells.require(is_known, column, expected, repeated.__getitem__, advice)
         place = {value: i for i, value in enumerate(index)}
         found["repeat_of"] = [place.get(value, -1) for value in repeated[cells.first]]
     return found
