@@ -11,12 +11,11 @@ from torch import Tensor
 from torch.distributions import Distribution
 
 from sbi_active.actions import ActionSpace
+from sbi_active.criticism.data.columns import split
 from sbi_active.criticism.data.input_series import require_covered
 from sbi_active.criticism.data.trials import Trials
-from sbi_active.criticism.data.units import split
 from sbi_active.criticism.effects.augmented import NUM_CHECKED, AugmentedSimulator
-from sbi_active.criticism.effects.declarations import require_distinct, require_nested
-from sbi_active.criticism.effects.effect import Effect
+from sbi_active.criticism.effects.effect import Effect, require_distinct, require_nested
 from sbi_active.criticism.effects.trial_conditions import (
     conditions_for,
     conditions_of_trials,

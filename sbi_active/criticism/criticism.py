@@ -277,7 +277,7 @@ class Criticism:
             )
         tracing = self.trace()
         with stage("next action", show_progress=self.show_progress):
-            return choose_action(self.rivals, tracing, space, beyond=beyond)
+            return choose_action(self.rivals, tracing, space, outside=beyond)
 
     def evaluate(self) -> Evaluation | None:
         """Return the error before and after, on held-out trials where there are any.

@@ -13,14 +13,20 @@ import pandas as pd
 
 from sbi_active.arrays import Array
 from sbi_active.criticism.data.cells import Cells, read_csv
-from sbi_active.criticism.data.columns import TRIAL, Column, find_columns
+from sbi_active.criticism.data.columns import (
+    TIME,
+    TRIAL,
+    Column,
+    find_columns,
+    split,
+    to_si,
+)
 from sbi_active.criticism.data.tables import (
     arguments_of,
     find_recordings,
     headers_of,
 )
 from sbi_active.criticism.data.trials import Trials
-from sbi_active.criticism.data.units import TIME, split, to_si
 from sbi_active.expected import require
 from sbi_active.messages import warn
 from sbi_active.mujoco.models.names import (

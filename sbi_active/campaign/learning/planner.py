@@ -59,7 +59,7 @@ class Planner:
         constraint: Callable[[Tensor], Tensor] | None = None,
         cost: Cost | None = None,
     ) -> None:
-        from sbi_active.criticism.effects.declarations import (
+        from sbi_active.criticism.effects.effect import (
             require_distinct,
             require_nested,
         )

@@ -43,7 +43,7 @@ def compare(
     """
     # Criticism reads results of everything below, so it is imported where it is used.
     from sbi_active.criticism import Criticism, Trials
-    from sbi_active.criticism.effects.declarations import require_kind
+    from sbi_active.criticism.effects.effect import require_kind
 
     require_kind(effects)
     if len(trials) < 2:
@@ -138,7 +138,7 @@ def require_effects(what: str, names: Sequence[str], effects: Sequence[Effect]) 
         names: Names of effects.
         effects: Effects that are given.
     """
-    from sbi_active.criticism.effects.declarations import require_kind
+    from sbi_active.criticism.effects.effect import require_kind
 
     require_kind(effects)
     lacking = {*names} - {effect.name for effect in effects}

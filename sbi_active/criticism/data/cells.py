@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import io
-import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -13,15 +12,10 @@ import numpy as np
 import pandas as pd
 
 from sbi_active.arrays import Array
-from sbi_active.criticism.data.columns import TRIAL, Column
-from sbi_active.criticism.data.units import TIME
+from sbi_active.criticism.data.columns import TIME, TRIAL, Column
+from sbi_active.expected import require
 
-#: What to do about a column that varies within a trial.
-IF_IT_VARIES = (
-    "call it input_* if it is commanded over time and x_* if it is measured, give a "
-    "start_* its value at the start in each row, or give each trial its own name"
-)
-EMPTY = ("", "nan", "none", "na", "<na>")
+EMPTY = ("", "nan", "none", "na", "<na>", "nat")
 
 
 class Cells:
@@ -51,23 +45,21 @@ class Cells:
         self.frame = whole.reset_index(drop=True)
         self.columns, self.source = columns, source
         self.is_long, self.is_named = bool(columns[TIME]), bool(columns[TRIAL])
-        num = len(self.frame)
         # Without names a row is a trial, or all rows are one series.
-        labels = [""] * num if self.is_long else [str(i + 1) for i in range(num)]
+        numbers = (self.frame.index + 1).astype(str)
+        labels = self.frame.index.map(lambda _: "") if self.is_long else numbers
         if self.is_named:
             words = [self.words(column) for column in columns[TRIAL]]
             labels = [" ".join(parts) for parts in zip(*words, strict=True)]
-            for column, each in zip(columns[TRIAL], words, strict=True):
-                for i in np.flatnonzero(each == ""):
-                    raise ValueError(
-                        f"expected the name of a trial in column {column.header}, "
-                        f"{self.row(i)}; got an empty cell in {self.file(i)}; fill it "
-                        "in"
-                    )
         self.trial, names = pd.factorize(np.array(labels, dtype=object))
         self.names: list[str] = [*names]
         self.members = [np.flatnonzero(self.trial == t) for t in range(len(names))]
         self.first = np.array([at[0] for at in self.members], dtype=int)
+        for column in columns[TRIAL]:
+            told = self.words(column)
+            self.require(
+                told != "", column, "the name of a trial", lambda _: "", "fill it in"
+            )
 
     @cached_property
     def time(self) -> Array:
@@ -76,100 +68,96 @@ class Cells:
             return np.zeros(len(self.frame))
         (column,) = self.columns[TIME]
         cells: Any = self.frame[column.header]
-        kinds = pd.api.types
-        if kinds.is_datetime64_any_dtype(cells) or kinds.is_timedelta64_dtype(cells):
-            for i in np.flatnonzero(cells.isna()):
-                raise ValueError(
-                    f"expected a time in {self.place(i)}; got none in {self.file(i)}; "
-                    "fill it in"
-                )
-            start = cells.iloc[self.first[self.trial]].reset_index(drop=True)
+        if cells.dtype.kind in "mM":  # dates are told from the start of each trial
+            told = cells.notna().to_numpy()
+            self.require(told, column, "a time", lambda i: cells[i], "fill it in")
+            start = cells.groupby(self.trial).transform("first")
             time = (cells - start).dt.total_seconds().to_numpy(float)
         else:
             time = self.numbers(column)
-        for at in self.members:
-            for k in np.flatnonzero(np.diff(time[at]) <= 0):
-                one, two = at[k], at[k + 1]
-                expected, advice = "times that increase within a trial", "sort its rows"
-                again = f"{time[two]:g} s in "
-                if time[one] == time[two]:
-                    expected, advice, again = "each sample once", "remove one", ""
-                where = f"{self.place(two)} of {self.file(two)}"
-                raise ValueError(
-                    f"expected {expected}; got {column.header} = {time[one]:g} s in "
-                    f"{self.row(one)} and {again}{where}; {advice}, or give each trial "
-                    "its own name"
-                )
+        rows = pd.DataFrame({"time": time, "row": [row + 1 for _, row in self._places]})
+        before = rows.groupby(self.trial).shift()
+
+        def said(i: int) -> str:
+            then, row = before.loc[i]
+            return f"{time[i]:g} s after {then:g} s of row {row:.0f}"
+
+        advice = "sort its rows, remove what is there twice, or give each trial its own"
+        increases = ~(time <= before["time"].to_numpy())
+        expected = "times that increase within a trial"
+        self.require(increases, column, expected, said, f"{advice} name")
         return time
 
     def numbers(self, column: Column, *, empty: bool = False) -> Array:
         """Return a column as numbers in SI, (n,), NaN where cells may be empty."""
         cells: Any = self.frame[column.header]
         text = cells.map(lambda cell: str(cell).strip())
-        kinds = pd.api.types
-        is_real = kinds.is_numeric_dtype(cells) and not kinds.is_complex_dtype(cells)
-        parsed: Any = pd.to_numeric(cells if is_real else text, errors="coerce")
+        given = cells if cells.dtype.kind in "biuf" else text
+        parsed: Any = pd.to_numeric(given, errors="coerce")
         values = parsed.to_numpy(dtype=float, na_value=np.nan) * column.factor
-        is_word = np.isnan(values) & ~text.str.lower().isin(EMPTY).to_numpy()
-        wrong = is_word | (np.abs(values) > np.finfo(np.float32).max)
-        for i in np.flatnonzero(wrong if empty else wrong | np.isnan(values)):
-            got = text.iloc[i] or "an empty cell"
-            raise ValueError(
-                f"expected a finite number in column {column.header}, {self.place(i)}; "
-                f"got {repr(got) if is_word[i] else got} in {self.file(i)}; "
-                f"{_remedy(column, got) if is_word[i] else ''}"
-                f"{'leave what was not measured empty' if empty else 'fill it in'}"
-            )
+        is_empty = text.str.lower().isin(EMPTY).to_numpy()
+        is_number = np.abs(values) <= np.finfo(np.float32).max
+        advice = "write decimals with a point and the unit in the header, as name[unit]"
+        advice += (
+            ", and leave what was not measured empty" if empty else ", and fill it in"
+        )
+        holds = is_number | (is_empty & empty)
+
+        def said(i: int) -> str:
+            return text[i] if is_empty[i] else repr(text[i])
+
+        self.require(holds, column, "a finite number", said, advice)
         return values
 
     def words(self, column: Column) -> Array:
         """Return a column as text, shape (n,), "" if it is empty."""
         cells = self.frame[column.header]
         text = cells.map(lambda cell: str(cell).strip())
-        if pd.api.types.is_float_dtype(cells):  # 1.0 and 1 name one trial
-            text = cells.map(_digits)
+        if cells.dtype.kind == "f":  # 1.0 and 1 name one trial
+            text = text.str.removesuffix(".0")
         return text.where(~text.str.lower().isin(EMPTY), "").to_numpy(dtype=object)
 
     def constant(self, column: Column, values: Array | None = None) -> Array:
         """Return the value of each trial in a column, which must not vary within it."""
         values = self.numbers(column) if values is None else values
         own = values[self.first]
-        for i in np.flatnonzero(values != own[self.trial]):
-            one = self.first[self.trial[i]]
-            raise ValueError(
-                f"expected one value of {column.header} in each trial; got "
-                f"{values[one]} in {self.row(one)} and {values[i]} in {self.place(i)} "
-                f"of {self.file(i)}; {IF_IT_VARIES}"
-            )
+        self.require(
+            values == own[self.trial],
+            column,
+            "one value in each trial",
+            lambda i: f"{values[i]} after {own[self.trial[i]]}",
+            "call it input_* if it is commanded over time and x_* if it is measured, "
+            "give a start_* its value at the start in each row, or give each trial its "
+            "own name",
+        )
         return own
 
-    def row(self, i: Any) -> str:
-        """Return the number of a row in its file, in words."""
-        return f"row {self._places[i][1] + 1}"
+    def require(
+        self,
+        holds: Array,
+        column: Column,
+        expected: str,
+        got: Callable[[int], object],
+        advice: str,
+    ) -> None:
+        """Raise at the first row at which something does not hold.
+
+        Args:
+            holds: Whether it holds, shape (n,).
+            column: Column of the cells.
+            expected: Description of a right cell.
+            got: Function that gives a cell in words.
+            advice: Advice on what to do.
+        """
+        for i in np.flatnonzero(~holds)[:1].tolist():
+            where = f"{expected} in column {column.header}, {self.place(i)}"
+            said = str(got(i)) or "an empty cell"
+            require(False, where, f"{said} in {self._places[i][0]}", advice)
 
     def place(self, i: Any) -> str:
-        """Return the number of a row with the name of its trial, in words."""
+        """Return the number of a row in its file and the name of its trial."""
         name = f" (trial {self.names[self.trial[i]]})" if self.is_named else ""
-        return self.row(i) + name
-
-    def file(self, i: Any) -> str:
-        """Return the file in which a row stands."""
-        return self._places[i][0]
-
-
-def _digits(value: float) -> str:
-    """Return a number that names a trial, with all its digits; 1.0 and 1 are one."""
-    return str(int(value)) if float(value).is_integer() else repr(float(value))
-
-
-def _remedy(column: Column, text: str) -> str:
-    """Return what to do about a cell that is no number."""
-    if re.fullmatch(r"[-+]?\d+,\d+", text):
-        return "write decimals with a point, and "
-    if re.fullmatch(r"[-+]?[\d.]+([eE][-+]?\d+)?\s*[^\d\s,;].*", text):
-        name = column.header.split("[")[0]
-        return f"write the unit once, in the header as {name}[unit], and "
-    return ""
+        return f"row {self._places[i][1] + 1}{name}"
 
 
 def read_csv(path: Path) -> pd.DataFrame:
@@ -182,28 +170,21 @@ def read_csv(path: Path) -> pd.DataFrame:
         with path.open(encoding="utf-8-sig", newline="") as file:
             # A "#" within a cell is a part of it: only whole lines are comments.
             lines = [line for line in file if not line.lstrip().startswith("#")]
-        header = next((line.strip() for line in lines if line.strip()), "")
-        if (found := re.search(r"[;\t]", header)) and "," not in header:
-            options = f"sep={found.group()!r}" + ", decimal=','" * (";" in header)
-            raise ValueError(
-                f"expected cells separated by commas; got {header!r} in {path}; save "
-                "the table with commas and decimal points, or pass "
-                f"Trials.from_dataframe(pandas.read_csv(path, {options}))"
-            )
-        table = pd.read_csv(
-            io.StringIO("".join(lines)), header=None, dtype=str, keep_default_na=False
-        )
-    except UnicodeDecodeError as error:
-        raise ValueError(
-            f"expected text in UTF-8; got other bytes in {path}; save the table as CSV "
-            "in UTF-8"
-        ) from error
-    except (pd.errors.EmptyDataError, pd.errors.ParserError) as error:
+        options: Any = {"header": None, "dtype": str, "keep_default_na": False}
+        table = pd.read_csv(io.StringIO("".join(lines)), **options)
+    except ValueError as error:  # of its bytes, or of its rows
         said = str(error).rpartition("error: ")[2].strip()
         raise ValueError(
-            f"expected names of columns, and rows of as many cells; got {said!r} in "
-            f"{path}; write decimals with a point, and put text that holds a comma in "
-            "quotes"
+            "expected text in UTF-8, names of columns, and rows of as many cells; got "
+            f"{said!r} in {path}; write decimals with a point, and put text that holds "
+            "a comma in quotes"
         ) from error
-    header = [str(c).strip() for c in table.iloc[0]]
+    header = [str(cell).strip() for cell in table.iloc[0]]
+    require(
+        len(header) > 1 or not {*";\t"} & {*header[0]},
+        "cells separated by commas",
+        f"{header[0]!r} in {path}",
+        "save the table with commas and decimal points, or pass Trials.from_dataframe("
+        "pandas.read_csv(path, sep=..., decimal=...))",
+    )
     return table.iloc[1:].set_axis(header, axis=1).reset_index(drop=True)

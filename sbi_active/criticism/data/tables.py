@@ -20,14 +20,14 @@ import pandas as pd
 from sbi_active.arrays import Array
 from sbi_active.criticism.data.cells import Cells, read_csv
 from sbi_active.criticism.data.columns import (
-    OPTIONAL,
+    TIME,
     TRIAL,
     Told,
     as_list,
     find_columns,
     require_columns,
+    split,
 )
-from sbi_active.criticism.data.units import TIME, split
 from sbi_active.expected import require
 from sbi_active.messages import warn
 
@@ -37,13 +37,15 @@ TABLE = "trials.csv"
 AGAIN = "remove one, or give each its own index where both were executed"
 SHOWN = 5  # places that a message lists
 
+Source = str | Path | pd.DataFrame
+
 
 def read_trials(
-    table: str | Path | pd.DataFrame,
+    table: Source,
     *,
     columns: Told | None = None,
     units: Mapping[str, str] | None = None,
-    inputs: str | Path | pd.DataFrame | None = None,
+    inputs: Source | None = None,
 ) -> dict[str, Any]:
     """Return the arguments of ``Trials`` that a CSV file, folder or data frame holds.
 
@@ -70,17 +72,17 @@ def read_trials(
             or a trial is there twice, inputs have gaps or do not cover x, or files of a
             folder have different columns. The text says where.
     """
+    beside, known = None, set[str]()
+    if inputs is not None:
+        beside, known = _inputs_beside(inputs, columns or {}, units or {})
+        columns = columns and {k: name for k, name in columns.items() if k != "input"}
     parts, columns = _parts(table, "the table", columns)
     source = str(table) if isinstance(table, str | Path) else "the table"
     headers = headers_of(parts)
-    known, beside = _names(headers), None
-    if inputs is not None:
-        beside = _inputs_beside(inputs, columns or {}, units or {})
-        known |= _names([*beside.frame.columns])
-        columns = columns and {k: name for k, name in columns.items() if k != "input"}
     for name in units or ():
         expected = f"units of columns {', '.join(headers)}"
-        require(name in known, expected, f"one of {name}", "correct the name")
+        is_column = name in known | _names(headers)
+        require(is_column, expected, f"one of {name}", "correct the name")
     found = find_columns(headers, columns=columns, units=units, source=source)
     own_inputs = ", ".join(column.header for column in found["input"])
     others = f"{own_inputs} in {source} and more beside"
@@ -117,7 +119,7 @@ def _natural(name: str) -> list[tuple[int, str]]:
 
 
 def _parts(
-    table: str | Path | pd.DataFrame, name: str, columns: Told | None = None
+    table: Source, name: str, columns: Told | None = None
 ) -> tuple[dict[str, pd.DataFrame], Told | None]:
     """Return the frames of a table by their files, and which columns are what.
 
@@ -129,7 +131,7 @@ def _parts(
     path = Path(table)
     paths = find_recordings(path) if path.is_dir() else [path]
     frames = {str(path): read_csv(path) for path in paths}
-    is_long = TIME in (columns or map(_bare, next(iter(frames.values())).columns))
+    is_long = TIME in (columns or _names(next(iter(frames.values())).columns))
     if not path.is_dir() or paths[0].name == TABLE or not is_long:
         return frames, columns
     told = [TRIAL] if columns is None else as_list(columns.get(TRIAL, ()))
@@ -153,38 +155,30 @@ def headers_of(parts: Mapping[str, pd.DataFrame]) -> list[str]:
     return own
 
 
-def _bare(header: str) -> str:
-    """Return a column's name without its unit."""
-    return split(header)[0]
-
-
-def _names(headers: Sequence[str]) -> set[str]:
+def _names(headers: Sequence[str] | pd.Index) -> set[str]:
     """Return the names of columns, with and without what stands in brackets."""
-    return {*headers, *map(_bare, headers)}
+    return {*headers, *(split(header)[0] for header in headers)}
 
 
 def _inputs_beside(
-    table: str | Path | pd.DataFrame, columns: Told, units: Mapping[str, str]
-) -> Cells:
-    """Return the rows of a table of inputs."""
+    table: Source, columns: Told, units: Mapping[str, str]
+) -> tuple[Cells, set[str]]:
+    """Return the rows of a table of inputs, and the names of its columns."""
     parts, _ = _parts(table, "the table of inputs")
     headers = headers_of(parts)
     source, names = next(iter(parts)), _names(headers)
     told = None
     if "input" in columns:  # what else is said holds for it where it has such columns
-        also = {
-            key: columns[key]
-            for key in (TRIAL, TIME)
-            if key in columns and names.issuperset(as_list(columns[key]))
-        }
-        told = {TIME: TIME, **also, "input": columns["input"]}
+        own = {k: columns[k] for k in (TRIAL, TIME) if k in columns}
+        own = {k: value for k, value in own.items() if names.issuperset(as_list(value))}
+        told = {TIME: TIME, **own, "input": columns["input"]}
     found = find_columns(headers, columns=told, units=units, source=source)
     require_columns(found, [TIME, "input"], source)
-    for role in ("action", "x", "start", *OPTIONAL):
-        expected = f"columns {TRIAL}, {TIME}, input_* in a table of inputs"
-        got = f"{role} in {source}"
-        require(not found[role], expected, got, "move it to the table of trials")
-    return Cells(parts, found, source)
+    others = [role for role in found if role not in (TRIAL, TIME, "input")]
+    got = ", ".join(column.header for role in others for column in found[role])
+    expected = f"columns {TRIAL}, {TIME}, input_* in a table of inputs"
+    require(not got, expected, f"{got} in {source}", "move it to the table of trials")
+    return Cells(parts, found, source), names
 
 
 def arguments_of(cells: Cells, beside: Cells | None = None) -> dict[str, Any]:
@@ -194,18 +188,66 @@ def arguments_of(cells: Cells, beside: Cells | None = None) -> dict[str, Any]:
         cells: Rows of the trials.
         beside: Rows of their inputs at times of their own; None for none.
     """
-    columns, first, names = cells.columns, cells.first, cells.names
-    members = cells.members
-    action = np.empty((len(first), 0))
+    columns, index = cells.columns, np.arange(len(cells.first), dtype=float)
+    action = np.empty((len(index), 0))
     if columns["action"]:
         action = np.stack([cells.constant(c) for c in columns["action"]], 1)
-    x = np.stack([cells.numbers(c, empty=True) for c in columns["x"]], 1)
-    found = {} if beside is None else _inputs(beside, names)
-    if columns["input"]:
-        found = _inputs(cells, names)
-        filled = np.asarray(np.isfinite(x).any(1))
-        values = [cells.numbers(c, empty=True) for c in columns["input"]]
-        given = np.asarray(np.isfinite(values).any(0))
+    for column in columns["index"]:
+        index = cells.constant(column)
+    x = _columns(cells, "x")
+    samples = _samples(cells, x)
+    _require_distinct(cells, action, samples, index)
+    values = [each[:, 1] if x.shape[1] == 1 else each[:, 1:] for each in samples]
+    found = {
+        "action": action if columns["action"] else None,
+        "x": values if cells.is_long else x,
+        "sample_times": [each[:, 0] for each in samples] if cells.is_long else None,
+        "index": index,
+        "names": cells.names if cells.is_named else None,
+        "start": {c.name: cells.constant(c) for c in columns["start"]} or None,
+        "action_labels": [c.label for c in columns["action"]] or None,
+        "channel_labels": [c.label for c in columns["x"]],
+    }
+    if beside is not None or columns["input"]:
+        found |= _inputs(beside or cells, cells.names)
+    _note_scales(cells, action, samples)
+    for column in columns["role"]:
+        roles = cells.words(column)
+        is_role = np.isin(roles.astype(str), ("", "fit", "held out", "held_out"))
+        advice = "write one of them, or leave it empty for fit"
+        cells.require(
+            is_role, column, "a role 'fit' or 'held out'", roles.__getitem__, advice
+        )
+        found["role"] = [role or "fit" for role in cells.constant(column, roles)]
+    for column in columns["repeat_of"]:
+        cells.constant(column, cells.words(column))
+        repeated = cells.numbers(column, empty=True)
+        is_known = ~(repeated >= 0) | np.isin(repeated, index)
+        advice = "give that of the first trial of this action"
+        expected = "an index of the table"
+        cells.require(is_known, column, expected, repeated.__getitem__, advice)
+        place = {value: i for i, value in enumerate(index)}
+        found["repeat_of"] = [place.get(value, -1) for value in repeated[cells.first]]
+    return found
+
+
+def _columns(cells: Cells, role: str) -> Array:
+    """Return the numbers of some columns, which may be empty, shape (n, k)."""
+    found = [cells.numbers(c, empty=True) for c in cells.columns[role]]
+    return np.array(found).reshape(len(found), len(cells.frame)).T
+
+
+def _samples(cells: Cells, x: Array) -> list[Array]:
+    """Return time and numbers of the samples of each trial, and note empty cells.
+
+    Args:
+        cells: Rows of the trials.
+        x: Numbers of each row, shape (n, k).
+    """
+    filled: Any = np.isfinite(x).any(1)
+    given: Any = np.isfinite(_columns(cells, "input")).any(1)
+    members = cells.members
+    if cells.columns["input"]:
         if len(lost := np.flatnonzero(filled & ~given)):
             warn(
                 f"SA209 {len(lost)} rows of {cells.source} have a measurement and no "
@@ -215,50 +257,20 @@ def arguments_of(cells: Cells, beside: Cells | None = None) -> dict[str, Any]:
         # Inputs may come more often than x: then a row without x is no sample.
         only = given & ~filled
         members = [at[~only[at]] if filled[at].any() else at for at in members]
-    _note_empty(cells, x, np.concatenate(members))
-    samples = [np.column_stack([cells.time[at], x[at]]) for at in members]
-    index = np.arange(len(first), dtype=float)
-    if columns["index"]:
-        index = cells.constant(columns["index"][0])
-    if cells.is_long or not columns["index"]:
-        _require_distinct(cells, action, samples)
-    for t in np.flatnonzero(pd.Series(index).duplicated()):
-        one, two = first[np.flatnonzero(index == index[t])[0]], first[t]
-        got = f"index {index[t]:g} in rows {one + 1} and {two + 1} of {cells.source}"
-        raise ValueError(f"expected each trial once; got {got}; {AGAIN}")
-    found |= {
-        "action": action if columns["action"] else None,
-        "x": x,
-        "index": index,
-        "names": names if cells.is_named else None,
-        "start": {c.name: cells.constant(c) for c in columns["start"]} or None,
-        "action_labels": [c.label for c in columns["action"]] or None,
-        "channel_labels": [c.label for c in columns["x"]],
-    }
-    for j, column in enumerate(columns["action"]):
-        _note_scales(cells, np.abs(action[:, [j]]), column.header)
-    if cells.is_long:
-        steps = [np.diff(s[:, 0]) for s in samples]
-        _note_scales(cells, steps, columns[TIME][0].header)
-        for j, column in enumerate(columns["x"], 1):
-            _note_scales(cells, [np.abs(s[:, j]) for s in samples], column.header)
-        found["x"] = [s[:, 1] if x.shape[1] == 1 else s[:, 1:] for s in samples]
-        found["sample_times"] = [s[:, 0] for s in samples]
-    for column in columns["role"]:
-        roles = cells.constant(column, cells.words(column))
-        for row, role in zip(first, roles, strict=True):
-            require(
-                role.replace("_", " ") in ("", "fit", "held out"),
-                f"a role 'fit' or 'held out' in column {column.header}",
-                f"{role!r} in {cells.place(row)} of {cells.file(row)}",
-                "write one of them, or leave it empty for fit",
+    rows = np.sort(np.concatenate(members))
+    # Sensors that are read at times of their own leave each other's cells empty.
+    rows_lost = rows[~filled[rows]] if cells.is_long else rows
+    for column, values in zip(cells.columns["x"], x.T, strict=True):
+        at = rows_lost[np.isnan(values[rows_lost])]
+        if len(at):
+            some = ", ".join(map(cells.place, at[:SHOWN]))
+            more = f" and {len(at) - SHOWN} more" if len(at) > SHOWN else ""
+            warn(
+                f"SA203 {len(at)} of {len(rows)} cells of column {column.header} in "
+                f"{cells.source} hold no number: {some}{more}; they count as not "
+                "measured",
             )
-        found["role"] = [role or "fit" for role in roles]
-    for column in columns["repeat_of"]:
-        cells.constant(column, cells.words(column))
-        repeated = cells.numbers(column, empty=True)[first]
-        found["repeat_of"] = _positions(cells, repeated, index)
-    return found
+    return [np.column_stack([cells.time[at], x[at]]) for at in members]
 
 
 def _inputs(cells: Cells, trials: Sequence[str]) -> dict[str, Any]:
@@ -287,52 +299,41 @@ def _inputs(cells: Cells, trials: Sequence[str]) -> dict[str, Any]:
     return {"inputs": series, "input_times": times, "input_labels": labels}
 
 
-def _require_distinct(cells: Cells, action: Array, samples: list[Array]) -> None:
-    """Raise if two trials are the same number for number."""
-    seen: dict[bytes, int] = {}
+def _require_distinct(
+    cells: Cells, action: Array, samples: list[Array], index: Array
+) -> None:
+    """Raise if two trials have one index, or are the same number for number."""
+    inputs, seen = _columns(cells, "input"), dict[object, int]()
     for t, own in enumerate(samples):
-        # Repeated trials without a measurement are alike, and yet two trials.
+        one = seen.setdefault(index[t], t)
+        got = f"index {index[t]:g} in trials {cells.names[one]} and {cells.names[t]}"
+        require(one == t, "each trial once", f"{got} of {cells.source}", AGAIN)
+        # Repeated trials without a measurement are alike, and yet two trials; so are
+        # rows that have an index each.
         has = np.isfinite(own[:, 1:])
-        if not (has.any() if cells.is_long else has.all()):
-            continue
-        at = cells.members[t]
-        inputs = [cells.numbers(c, empty=True)[at] for c in cells.columns["input"]]
-        told = np.concatenate([action[t], own.ravel(), *inputs])
-        one = seen.setdefault(told.tobytes(), t)
-        got = f"the same numbers in {'trials' if cells.is_long else 'rows'} "
-        got += f"{cells.names[one]} and {cells.names[t]} of {cells.source}"
-        require(one == t, "each trial once", got, AGAIN)
-
-
-def _positions(cells: Cells, repeated: Array, index: Array) -> list[int]:
-    """Return the position of each repeated trial, -1 for none."""
-    place = {value: i for i, value in enumerate(index)}
-    for t in np.flatnonzero((repeated >= 0) & ~np.isin(repeated, index)):
-        raise ValueError(
-            f"expected in repeat_of an index of the table; got {repeated[t]:g} in "
-            f"{cells.place(cells.first[t])} of {cells.source}; give that of the first "
-            "trial of this action"
+        is_told = (
+            has.any() if cells.is_long else has.all() and not cells.columns["index"]
         )
-    return [place[value] if value >= 0 else -1 for value in repeated]
+        told = np.concatenate(
+            [action[t], own.ravel(), inputs[cells.members[t]].ravel()]
+        )
+        one = seen.setdefault(told.tobytes(), t) if is_told else t
+        got = f"the same numbers in trials {cells.names[one]} and {cells.names[t]}"
+        require(one == t, "each trial once", f"{got} of {cells.source}", AGAIN)
 
 
-def _note_empty(cells: Cells, x: Array, rows: Array) -> None:
-    """Warn of what counts as not measured."""
-    # Sensors that are read at times of their own leave each other's cells empty.
-    others: Any = np.isfinite(x).any(1) & cells.is_long
-    for column, values in zip(cells.columns["x"], x.T, strict=True):
-        at = np.sort(rows[np.isnan(values[rows]) & ~others[rows]])
-        if len(at):
-            some = ", ".join(map(cells.place, at[:SHOWN]))
-            more = f" and {len(at) - SHOWN} more" if len(at) > SHOWN else ""
-            warn(
-                f"SA203 {len(at)} of {len(rows)} cells of column {column.header} in "
-                f"{cells.source} hold no number: {some}{more}; they count as not "
-                "measured",
-            )
+def _note_scales(cells: Cells, action: Array, samples: Sequence[Array]) -> None:
+    """Warn of columns that may be in another unit in some trials."""
+    for column, own in zip(cells.columns["action"], action.T, strict=True):
+        _note_scale(cells, np.abs(own)[:, None], column.header)
+    if cells.is_long:
+        steps = [np.diff(each[:, 0]) for each in samples]
+        _note_scale(cells, steps, cells.columns[TIME][0].header)
+        for j, column in enumerate(cells.columns["x"], 1):
+            _note_scale(cells, [np.abs(s[:, j]) for s in samples], column.header)
 
 
-def _note_scales(
+def _note_scale(
     cells: Cells,
     sizes: Sequence[Array] | Array,
     header: str,

@@ -332,34 +332,34 @@ class Trials:
         new = {int(place): i for i, place in reversed([*enumerate(first)])}
         new |= {int(old): i for i, old in enumerate(at)}
         some = copy.copy(self)
-        some.action, some.x, some.index = self.action[at], self.x[at], self.index[at]
+        for name in self._by_trial():
+            setattr(some, name, rows_at(getattr(self, name), at))
         some.role = [self.role[i] for i in at]
         some.repeat_of = root(torch.tensor([new[int(place)] for place in first]))
-        if self.sample_times is not None and self.sample_times.ndim > 1:
-            some.sample_times = self.sample_times[at]
-        some.inputs, some.start = rows_at(self.inputs, at), rows_at(self.start, at)
         if self._names is not None:  # of trials that may be there twice now
             some._names = tuple(self._names[i] for i in at)
         return some
 
     def joined(self, further: Trials) -> Trials:
         """Return these trials with further ones of the same machine behind them."""
-        both, times = copy.copy(self), self.sample_times
-        both.action = torch.cat([self.action, further.action])
-        both.x = torch.cat([self.x, further.x])
-        both.index = torch.cat([self.index, further.index])
+        both, others = copy.copy(self), copy.copy(further)
+        if others.sample_times is not None:
+            others.sample_times = others.sample_times.expand(len(others), -1)
+        for name in self._by_trial():
+            parts = getattr(self, name), getattr(others, name)
+            setattr(both, name, rows_joined(*parts))
         both.role = [*self.role, *further.role]
-        if times is not None and times.ndim > 1:
-            assert further.sample_times is not None
-            others = further.sample_times.expand(len(further), -1)
-            both.sample_times = torch.cat([times, others])
-        both.inputs = rows_joined(self.inputs, further.inputs)
-        both.start = rows_joined(self.start, further.start)
         if self._names is not None:
             new = [f"new {n}" if n in self._names else n for n in further.names]
             both._names = (*self._names, *new)
         both.repeat_of = repeated(both.settings())
         return both
+
+    def _by_trial(self) -> list[str]:
+        """Return the names of the attributes that have a row a trial."""
+        times = self.sample_times
+        own = ["sample_times"] if times is not None and times.ndim > 1 else []
+        return ["action", "x", "index", "inputs", "start", *own]
 
     def _of(self, role: Role) -> Trials:
         positions = [i for i, r in enumerate(self.role) if r == role]

@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 from typing_extensions import override
@@ -17,12 +18,17 @@ from sbi_active.criticism.effects.application import (
     nulls,
     require_positive,
 )
-from sbi_active.criticism.effects.declarations import require_distinct
-from sbi_active.criticism.effects.effect import Context, Effect
+from sbi_active.criticism.effects.effect import Context, Effect, require_distinct
 from sbi_active.expected import require
 from sbi_active.seeding import forked_generators, row_seeds
 from sbi_active.simulation import SimulatorModel
-from sbi_active.simulation.conditions import CONDITIONS, at_rows, played, typed
+from sbi_active.simulation.conditions import (
+    CONDITIONS,
+    at_rows,
+    changed,
+    played,
+    typed,
+)
 from sbi_active.simulation.model import NOISE_STREAM
 
 #: Rows on which an effect is compared with the simulator without it; of those that are
@@ -152,9 +158,8 @@ class AugmentedSimulator(SimulatorModel):
             Shape (n, *x_shape).
         """
         rows = self._rows(phi, action, index, context)
-        self._check_first(theta, rows)
         merge = merge and self.noise is not None  # a draw is another at each call
-        return self._evaluate(theta, rows, seeds, merge=merge)
+        return self._checked(theta, rows, seeds, merge=merge)
 
     def noise_scale(
         self,
@@ -191,18 +196,18 @@ class AugmentedSimulator(SimulatorModel):
     def __call__(
         self, theta: Tensor, action: Tensor, seeds: Tensor | None = None, **effects: Any
     ) -> Tensor:
-        phi = self._trial_draws(len(theta), theta.dtype, seeds)
-        mean = self._run(theta, action, seeds, effects, phi)
+        drawn = self._trial_draws(len(theta), theta.dtype, seeds)
+        mean = self._run(theta, action, seeds, effects, drawn)
         if self.noise is None:
             return mean
         if self.fn_takes_seeds and seeds is not None:
             seeds = seeds ^ NOISE_STREAM
         x = self.noise.sample(mean, seeds)
         _, phi = self.split(theta)
-        if self._active("noise", phi):
-            # The noise model draws; effects stretch what it drew.
-            x = mean + (x - mean) * self.noise_scale(phi, action, torch.ones_like(x))
-        return x
+        # The noise model draws; effects stretch what it drew.
+        one = torch.ones_like(x)
+        scale = self.noise_scale(phi, action, one)
+        return x if scale is one else mean + (x - mean) * scale
 
     def _run(
         self,
@@ -216,17 +221,14 @@ class AugmentedSimulator(SimulatorModel):
         told = {name: effects[name] for name in CONDITIONS if name in effects}
         rest = {name: value for name, value in effects.items() if name not in told}
         rows = self._rows(phi | (drawn or {}), torch.as_tensor(action), **told)
-        self._check_first(theta, rows)
-        return self._evaluate(theta, rows, seeds, rest)
+        return self._checked(theta, rows, seeds, rest)
 
     def _trial_draws(
         self, num: int, dtype: torch.dtype, seeds: Tensor | None
     ) -> dict[str, Tensor]:
         """Return draws of the effects of scope "trial", rows by their seeds."""
         trial = [e for e in self.effects if e.scope == "trial"]
-        if not trial:
-            return {}
-        if seeds is None:
+        if seeds is None or not trial:
             return {e.name: e.sample(num).to(dtype) for e in trial}
         rows = []
         for seed in seeds.tolist():
@@ -251,14 +253,20 @@ class AugmentedSimulator(SimulatorModel):
             known["times"] = self._times
         return _Rows(phi, action, Context(**typed(known, action.dtype)))
 
-    def _check_first(self, theta: Tensor, rows: _Rows) -> None:
-        """Compare effects that were not yet with the simulator on a few rows."""
+    def _checked(
+        self,
+        theta: Tensor,
+        rows: _Rows,
+        seeds: Tensor | None,
+        keywords: Mapping[str, Any] | None = None,
+        *,
+        merge: bool = False,
+    ) -> Tensor:
+        """Return x, after a look at whether effects vanish in the first rows."""
         few = slice(NUM_FIRST)
         if self._unchecked and len(theta):
             self._check_null(theta[few], rows.at(few))
-
-    def _active(self, hook: str, phi: dict[str, Tensor]) -> list[Effect]:
-        return [e for e in self.effects if e.hook == hook and e.name in phi]
+        return self._evaluate(theta, rows, seeds, keywords, merge=merge)
 
     def _evaluate(
         self,
@@ -279,20 +287,21 @@ class AugmentedSimulator(SimulatorModel):
         told = self._told(rows) | dict(keywords or {})
         told = self._through("dynamics", told, rows)
         run = self._run_merged if merge else self.base._run
-        x = run(theta, action, seeds, told)
-        return self._through("observation", x, rows)
+        return self._through("observation", run(theta, action, seeds, told), rows)
 
     def _through(self, hook: str, value: Any, rows: _Rows) -> Any:
         """Return a value as all effects of a hook change it, one after the other."""
-        for effect in self._active(hook, rows.phi):
-            own = rows.phi[effect.name]
-            value = applied(effect, value, own, rows.action, rows.context)
+        for effect in self.effects:
+            if effect.hook == hook and effect.name in rows.phi:
+                own = rows.phi[effect.name]
+                value = applied(effect, value, own, rows.action, rows.context)
         return value
 
     def _told(self, rows: _Rows) -> dict[str, Any]:
         """Return what the simulator's function is told of how its trials are run."""
         context, wanted = rows.context, self.base.conditions
-        for effect in self._active("input", rows.phi):
+        acting = [e for e in self.effects if e.hook == "input" and e.name in rows.phi]
+        for effect in acting:
             require(
                 context.inputs is not None and "inputs" in wanted,
                 f"inputs over time for effect {effect.name!r}, in the trials and as an "
@@ -301,11 +310,7 @@ class AugmentedSimulator(SimulatorModel):
                 "pass Trials(inputs=...), and take fn(theta, action, *, inputs)",
             )
         inputs = self._through("input", context.inputs, rows)
-        every = {**vars(context), "inputs": inputs}
-        if context.times is not None:
-            # The simulator is read where the trial was, not on a grid of its own.
-            every["times"] = context.times.expand(len(rows.action), -1)
-        return {k: every[k] for k in wanted if every[k] is not None}
+        return replace(context, inputs=inputs).told(wanted)
 
     def _run_merged(
         self,
@@ -315,17 +320,16 @@ class AugmentedSimulator(SimulatorModel):
         keywords: dict[str, Any],
     ) -> Tensor:
         """Run each distinct row once."""
-        columns = [theta, action, *([] if seeds is None else [seeds])]
-        columns += _row_tensors(keywords, len(theta))
-        rows = torch.cat([c.reshape(len(theta), -1).double() for c in columns], 1)
-        _, place = torch.unique(rows, dim=0, return_inverse=True)
-        first = torch.full((int(place.max()) + 1,), len(theta), dtype=torch.int64)
-        first = first.scatter_reduce(0, place, torch.arange(len(theta)), "amin")
-        some = at_rows(keywords, first)
-        x = self.base._run(
-            theta[first], action[first], None if seeds is None else seeds[first], some
+        columns: list[Any] = [theta, action, *([] if seeds is None else [seeds])]
+        changed(keywords, columns.append)
+        per_row = [c for c in columns if np.shape(c)[:1] == (len(theta),)]
+        rows = torch.cat([c.reshape(len(theta), -1).double() for c in per_row], 1)
+        _, first, place = np.unique(
+            rows.numpy(), axis=0, return_index=True, return_inverse=True
         )
-        return x[place]
+        some = None if seeds is None else seeds[first]
+        x = self.base._run(theta[first], action[first], some, at_rows(keywords, first))
+        return x[place.reshape(-1)]
 
     def _check_null(self, theta: Tensor, rows: _Rows) -> None:
         """Raise if an effect at its null changes x.
@@ -343,23 +347,23 @@ class AugmentedSimulator(SimulatorModel):
         spread = float(finite.std()) if len(finite) > 1 else 0.0
         scale = max(spread, float(finite.abs().mean()) if len(finite) else 0.0, 1e-30)
         for effect in self._unchecked:
-            changed, without, size = "x", x, scale
-            if effect.hook == "noise":
-                changed, without, size = "the noise", one, 1.0
-            difference = torch.inf
+            is_noise = effect.hook == "noise"
+            what, without, size = (
+                ("the noise", one, 1.0) if is_noise else ("x", x, scale)
+            )
+            found = []
             for null in nulls(effect, x):
                 own = replace(rows, phi={effect.name: null})
-                at_null = self._through("noise", one, own)
-                if effect.hook != "noise":
-                    at_null = self._seeded(theta, own)
-                difference = min(difference, largest_change(without, at_null))
+                at_null = self._seeded(theta, own)
+                at_null = self._through("noise", one, own) if is_noise else at_null
+                found.append(largest_change(without, at_null))
             require(
-                difference <= tolerance * size,
+                min(found) <= tolerance * size,
                 f"effect {effect.name!r} to vanish at its null {effect.null}",
-                f"{changed} changed by up to {difference:.3g}",
+                f"{what} changed by up to {min(found):.3g}",
                 "correct apply or null",
             )
-            if effect.hook == "noise":
+            if is_noise:
                 require_positive(effect, one, rows.action, rows.context)
         self._unchecked = []
 
@@ -368,14 +372,3 @@ class AugmentedSimulator(SimulatorModel):
         seeds = row_seeds(0, len(theta))
         with forked_generators(0, "null"):
             return self._evaluate(theta, rows, seeds)
-
-
-def _row_tensors(keywords: Mapping[str, Any], num: int) -> list[Tensor]:
-    """Return the tensors among keyword arguments that have one entry a row."""
-    found = []
-    for name, value in keywords.items():
-        if isinstance(value, Mapping):
-            found += _row_tensors(value, num)
-        elif name != "input_times" and torch.is_tensor(value):
-            found += [value] if value.shape[:1] == (num,) else []
-    return found

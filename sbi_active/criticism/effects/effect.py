@@ -1,9 +1,9 @@
-"""Effects: named, parameterized extensions of a simulator."""
+"""Effects: named, parameterized extensions of a simulator, and checks of them."""
 
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal, get_args
 
@@ -11,8 +11,9 @@ import torch
 from torch import Tensor
 from torch.distributions import Distribution
 
+from sbi_active.arrays import measured
 from sbi_active.criticism.data.arrays import rows_at
-from sbi_active.expected import require, suggests
+from sbi_active.expected import require, require_one_of, suggests
 from sbi_active.inference.beliefs.priors import is_discrete
 from sbi_active.seeding import forked_generators
 from sbi_active.support import parts_of, support_of
@@ -58,6 +59,13 @@ class Context:
             inputs=rows_at(self.inputs, rows),
             start=rows_at(self.start, rows),
         )
+
+    def told(self, names: Iterable[str]) -> dict[str, Any]:
+        """Return those of some conditions that are known, times in each row."""
+        known = vars(self)
+        if self.times is not None:
+            known = known | {"times": self.times.expand(len(self.index), -1)}
+        return {name: known[name] for name in names if known[name] is not None}
 
 
 @suggests
@@ -217,53 +225,29 @@ def _require_parts(effect: Effect) -> None:
         is_text = isinstance(value, str) or (value is None and part in OPTIONAL)
         require(is_text, f"{part} of an effect as text", repr(value), "pass a string")
     require(bool(effect.name), "a name of an effect", "''", "pass one")
-    require(
-        isinstance(effect.prior, Distribution),
-        f"a torch distribution as prior {own}",
-        repr(effect.prior),
-        "pass for example Normal(0.0, 1.0)",
-    )
-    require(
-        not any(is_discrete(part) for part in parts_of(effect.prior.support)),
-        f"a continuous prior {own}",
-        "a discrete one",
-        "declare one effect for each value, which then compete",
-    )
+    prior, is_prior = effect.prior, isinstance(effect.prior, Distribution)
+    advice, expected = "pass for example Normal(0.0, 1.0)", "a continuous torch prior"
+    require(is_prior, f"{expected} {own}", repr(prior), advice)
+    is_continuous = not any(is_discrete(part) for part in parts_of(prior.support))
+    advice = "declare one effect for each value, which then compete"
+    require(is_continuous, f"{expected} {own}", "a discrete one", advice)
     expected = f"apply {own} as a function of (value, phi, action, context)"
     require(callable(effect.apply), expected, repr(effect.apply), "pass one")
-    known = ", ".join(get_args(Hook))
-    advice = f"say what effect {effect.name!r} changes"
-    is_hook = effect.hook in get_args(Hook)
-    require(is_hook, f"a hook of {known}", repr(effect.hook), advice)
-    is_scope, expected = effect.scope in SCOPES, "scope 'campaign' or 'trial'"
-    require(is_scope, expected, repr(effect.scope), "choose one")
+    require_one_of(effect, hook=get_args(Hook), scope=SCOPES)
 
 
 def _sound_null(effect: Effect) -> Any:
     """Return the null, a copy where it is an array, or raise where it is none."""
-    own, pass_it = f"a null of effect {effect.name!r}", "pass the value of phi at which"
-    try:
-        null = torch.as_tensor(effect.null, dtype=torch.float64)
-    except (TypeError, ValueError, RuntimeError) as error:
-        raise ValueError(
-            f"expected {own} in numbers; got {effect.null!r}; {pass_it} it vanishes"
-        ) from error
-    require(
-        null.numel() in (1, effect.phi_dim),
-        f"a null of shape ({effect.phi_dim},), the shape of a draw of effect "
-        f"{effect.name!r}",
-        tuple(null.shape),
-        "give one each",
-    )
-    advice = f"{pass_it} it vanishes, which may be infinite"
-    require(not bool(null.isnan().any()), own, "NaN", advice)
-    lost = ~effect.declared_draws().isfinite()
-    require(
-        not bool(lost.any()),
-        f"finite draws from the prior of effect {effect.name!r}",
-        f"NaN or inf in {int(lost.any(-1).sum())} of {NUM_DRAWS}",
-        "pass a prior whose draws are numbers",
-    )
+    own, advice = f"of effect {effect.name!r}", "pass the value at which it vanishes"
+    null = measured(effect.null, name=f"null {own}")
+    expected = f"a null {own} of shape ({effect.phi_dim},), that of a draw"
+    one_each = null.numel() in (1, effect.phi_dim)
+    require(one_each, expected, tuple(null.shape), "give one each")
+    require(not bool(null.isnan().any()), f"a null {own}", "NaN", f"{advice}, or inf")
+    lost = int((~effect.declared_draws().isfinite()).any(-1).sum())
+    got = f"NaN or inf in {lost} of {NUM_DRAWS}"
+    advice = "pass a prior whose draws are numbers"
+    require(lost == 0, f"finite draws from the prior {own}", got, advice)
     return copy.deepcopy(effect.null)
 
 
@@ -292,3 +276,70 @@ class UnderKey:
             phi = torch.cat([phi, place[:, None]], 1)
         others = value.get(self.keyword) or {}
         return {**value, self.keyword: {**others, self.key: phi}}
+
+
+def require_nested(effects: Sequence[Effect]) -> None:
+    """Raise if a prior excludes the null, so that no phi is close to no effect.
+
+    The edge of a support counts as within, and so does an infinite null. Nuisances of
+    each trial are always there and need none.
+    """
+    for effect in effects:
+        if effect.scope == "campaign" and not _reaches_null(effect):
+            raise ValueError(
+                f"expected a prior of effect {effect.name!r} that allows its null "
+                f"{_in_words(effect)}, at which it vanishes; got {effect.prior}; "
+                "pass a prior whose support includes the null, or correct the null"
+            )
+
+
+def require_kind(effects: Sequence[Effect]) -> None:
+    """Raise a TypeError if effects are none, as where their names are given."""
+    for effect in effects:
+        if not isinstance(effect, Effect):
+            raise TypeError(
+                f"expected effects of class Effect; got {effect!r:.80}; pass "
+                "Effect(...), or those of generic_effects(...)"
+            )
+
+
+def require_distinct(effects: Sequence[Effect], parameters: Sequence[str] = ()) -> None:
+    """Raise if two numbers would have one name in tables and records.
+
+    Args:
+        effects: Effects by their own names, whose parts between " + " must not come
+            again either, since that joins names, and those of the entries of their phi.
+        parameters: Names of the simulator's own.
+    """
+    require_kind(effects)
+    parts = [part for effect in effects for part in effect.name.split(" + ")]
+    _require_once(parts, "effects with distinct names")
+    shown = [effect for effect in effects if effect.scope == "campaign"]
+    entries = [name for effect in shown for name in effect.phi_names]
+    _require_once(
+        [*parameters, *entries], "effects named unlike parameters and entries of phi"
+    )
+
+
+def _require_once(names: Sequence[str], expected: str) -> None:
+    twice = sorted({name for name in names if names.count(name) > 1})
+    if twice:
+        raise ValueError(
+            f"expected {expected}; got {', '.join(twice)} more than once; rename "
+            "one of them"
+        )
+
+
+def _reaches_null(effect: Effect) -> bool:
+    """Return whether the prior allows the null; on the edge of a support it does."""
+    draws = effect.declared_draws()
+    null = effect.null_phi(NUM_DRAWS)
+    known = null.isfinite()
+    near = torch.where(known, null + 1e-6 * (draws - null), draws)
+    exact = torch.where(known, null, draws)
+    return bool((effect.log_prob(torch.cat([exact, near])) > -torch.inf).any())
+
+
+def _in_words(effect: Effect) -> str:
+    null = effect.null
+    return str(null.tolist()) if torch.is_tensor(null) else f"{null}"

@@ -215,12 +215,13 @@ def _fitted(
         for j, (_, order) in enumerate(wanted):
             t, x = _first(trials, i, stamps[i], series[i, j], within, degree)
             t = t - (t[0] if at is None else at)
-            value, error = _polynomial(t, x, degree)
-            misfit = x - np.polynomial.Polynomial(value)(t)
-            freedom, own = max(len(t) - degree - 1, 1), sds[j]
-            p_value[i] = min(p_value[i], chi2.sf(np.sum((misfit / own) ** 2), freedom))
-            values[i, j] = factorial(order) * value[order]
-            errors[i, j] = factorial(order) * own * error[order]
+            value, covariance = np.polyfit(t, x, degree, cov="unscaled")
+            misfit = (x - np.polyval(value, t)) / sds[j]
+            freedom, place = max(len(t) - degree - 1, 1), degree - order
+            p_value[i] = min(p_value[i], chi2.sf(np.sum(misfit**2), freedom))
+            values[i, j] = factorial(order) * value[place]
+            error = sds[j] * np.sqrt(covariance[place, place])
+            errors[i, j] = factorial(order) * error
     return values, errors, p_value
 
 
@@ -259,12 +260,3 @@ def _first(
         "pass a larger within, or name the unit of the times, as in time_ms",
     )
     return t[kept], x[kept]
-
-
-def _polynomial(t: Array, x: Array, degree: int) -> tuple[Array, Array]:
-    """Return coefficients by least squares, and their errors for a unit error of x."""
-    scale = max(float(np.abs(t).max()), 1e-300)
-    powers = scale ** np.arange(degree + 1.0)
-    a = np.vander(t / scale, degree + 1, increasing=True)
-    inverse = np.linalg.inv(a.T @ a)
-    return inverse @ a.T @ x / powers, np.sqrt(np.diag(inverse)) / powers

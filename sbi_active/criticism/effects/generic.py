@@ -11,8 +11,8 @@ from torch import Tensor
 from torch.distributions import Distribution
 
 from sbi_active.actions import ActionSpace
+from sbi_active.criticism.data.columns import split
 from sbi_active.criticism.data.trials import Trials
-from sbi_active.criticism.data.units import split
 from sbi_active.criticism.effects.changes import Wrapped
 from sbi_active.criticism.effects.effect import Effect, Hook
 from sbi_active.criticism.effects.table import rows_of

@@ -10,8 +10,7 @@ from torch import Tensor
 from torch.distributions import Distribution, constraints
 from typing_extensions import override
 
-from sbi_active.criticism.effects.declarations import require_distinct
-from sbi_active.criticism.effects.effect import Effect
+from sbi_active.criticism.effects.effect import Effect, require_distinct
 from sbi_active.expected import require
 from sbi_active.seeding import kept_generators
 from sbi_active.support import support_of

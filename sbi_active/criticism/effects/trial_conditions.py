@@ -48,11 +48,8 @@ def conditions_for(
         rows: Position of each row's trial, shape (n,).
         dtype: Type of the tensors.
     """
-    context = vars(conditions_of_trials(trials, rows, model))
-    found = {k: context[k] for k in model.conditions if context[k] is not None}
-    if "times" in found:
-        found["times"] = found["times"].expand(len(rows), -1)
-    return typed(found, dtype)
+    context = conditions_of_trials(trials, rows, model)
+    return typed(context.told(model.conditions), dtype)
 
 
 def has_own_times(model: SimulatorModel, trials: Trials) -> bool:

@@ -14,8 +14,8 @@ from scipy.spatial.distance import cdist
 from scipy.special import gammaln
 
 from sbi_active.criticism.criticism import Criticism
-from sbi_active.criticism.next_trial.candidates import following
-from sbi_active.criticism.report.predicted import Registered, TestedTrial
+from sbi_active.criticism.next_trial.next_action import following
+from sbi_active.criticism.report.contents import Registered, TestedTrial
 from sbi_active.criticism.report.report import Report
 from sbi_active.criticism.results import NONE, UNEXPLAINED, Array, ModelKey
 from sbi_active.criticism.steps.predictive import predict

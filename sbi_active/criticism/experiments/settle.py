@@ -25,7 +25,7 @@ from sbi_active.criticism.experiments.choice import (
     register,
     unless_unproven,
 )
-from sbi_active.criticism.report.predicted import Registered, TestedTrial
+from sbi_active.criticism.report.contents import Registered, TestedTrial
 from sbi_active.criticism.report.report import Report
 from sbi_active.criticism.results import Array
 from sbi_active.criticism.rivals.further_trials import unmeasured

@@ -4,7 +4,7 @@ This package contains the forces, their sizes along nominal trajectories, and th
 effects made of them. The comparison of forces with trials is elsewhere.
 """
 
-from sbi_active.criticism.forces.force import Force, total_force
+from sbi_active.criticism.forces.dictionary import Force, total_force
 from sbi_active.criticism.forces.library import force_effects
 
 __all__ = ["Force", "force_effects", "total_force"]

@@ -16,7 +16,7 @@ from sbi_active.arrays import Array
 from sbi_active.criticism.data.trials import Trials
 from sbi_active.criticism.effects.augmented import AugmentedSimulator
 from sbi_active.criticism.effects.effect import Context, Effect, UnderKey
-from sbi_active.criticism.effects.patterns import picked
+from sbi_active.criticism.effects.table import picked
 from sbi_active.criticism.forces.dictionary import (
     FORMS,
     FREE,
@@ -208,7 +208,7 @@ def _joints(
         velocity = float(max(np.sqrt(np.mean(v**2)), 1e-12))
         low, high = zip(_ends(q / position), _ends(v / velocity), strict=True)
         unit = "N" if name in slides else "N m"
-        found.append(Joint(name, k, k, unit, position, velocity, low, high))
+        found.append(Joint(name, k, unit, position, velocity, low, high))
     return found
 
 

@@ -78,6 +78,24 @@ class Linear:
         full = enlarged(model, self.rival, ~free, at[~free], columns)
         return replace(self, unit=unit, model=full)
 
+    def of(self, rival: Rival, bare: LinearModel) -> Linear:
+        """Return the linear model with some of its effects.
+
+        Args:
+            rival: Rival with those effects.
+            bare: Linear model in units, without any.
+        """
+        kept = [e in rival.effects for e in self.rival.effects]
+        at = np.append(kept, True)[self.effect]
+        effect, null = (
+            np.append(np.cumsum(kept) - 1, -1)[self.effect[at]],
+            self.null[at],
+        )
+        new = effect >= 0
+        columns = self.model.jacobian[:, at][:, new]
+        model = enlarged(bare, rival, new, null[new], columns)
+        return replace(self, rival=rival, effect=effect, null=null, model=model)
+
     @property
     def origin(self) -> Array:
         """Point of linearization, with effects at their null, shape (d,)."""
@@ -166,9 +184,10 @@ def fitted(
     doubtful = [e for e in beside if e.scope == "campaign"]
     fit, unit = _searched(bare, own, seed)
     linear = _beside(_with(bare, doubtful), fit, unit, own)
-    if aliases := _aliases(linear, own.alias):
-        doubtful = [e for e in doubtful if e.name not in aliases]
-        linear = _beside(_with(bare, doubtful), fit, unit, own)
+    told, aliases = _told(linear, own.alias)
+    if len(told) < len(doubtful):
+        doubtful = told
+        linear = linear.of(_with(bare, told), fit)
     m, c = linear.measurements, linear.rival.coordinates
     share = 1.0 if known_sd is None else ((known_sd[m.channel] / unit) ** 2).min()
     errors = own.errors(m, float(share))
@@ -301,8 +320,11 @@ def _beside(
     return found.around(bare, effect < 0, unit, settings.tried)
 
 
-def _aliases(found: Linear, least: float) -> tuple[str, ...]:
-    """Return the effects that a change of the parameters imitates."""
+def _told(found: Linear, least: float) -> tuple[list[Effect], tuple[str, ...]]:
+    """Return the effects that no change of the parameters imitates, and the others.
+
+    Those that change nothing are neither.
+    """
     jacobian, effect = found.model.jacobian, found.effect
     basis = basis_of(jacobian[:, effect < 0])
     left = jacobian - basis @ (basis.T @ jacobian)
@@ -310,8 +332,11 @@ def _aliases(found: Linear, least: float) -> tuple[str, ...]:
         np.sqrt(np.bincount(effect + 1, (part**2).sum(0))[1:])
         for part in (left, jacobian)
     )
-    each = zip(found.rival.effects, own, whole, strict=True)
-    return tuple(e.name for e, part, size in each if part <= least * size)
+    effects, is_told = found.rival.effects, own > least * whole
+    is_alias = ~is_told & (whole > 0)
+    aliases = [e.name for e, alias in zip(effects, is_alias, strict=True) if alias]
+    told = [e for e, own in zip(effects, is_told, strict=True) if own]
+    return told, (*aliases,)
 
 
 @dataclass(frozen=True)

@@ -28,6 +28,7 @@ from sbi_active.inference.sampling.weights import (
 )
 from sbi_active.seeding import derive_seed, forked_generators
 from sbi_active.simulation import GaussianNoise, SimulatorModel
+from sbi_active.threads import single_thread
 
 
 class IdentifiedBelief(KernelBelief):
@@ -73,6 +74,7 @@ class IdentifiedBelief(KernelBelief):
 
 
 @suggests
+@single_thread()
 def identify(
     model: SimulatorModel,
     prior: Distribution,

@@ -20,22 +20,21 @@ References:
 from __future__ import annotations
 
 import numpy as np
-import torch
 from torch import Tensor
 
 from sbi_active.actions import ActionSpace
-from sbi_active.arrays import Array
 from sbi_active.criticism.contradictions import SevereTest
 from sbi_active.criticism.evidence.rival_set import RivalSet
-from sbi_active.criticism.next_trial.candidates import (
+from sbi_active.criticism.next_trial.next_action import (
     PLAN,
-    extrapolated,
+    beyond_range,
     following,
     permitted_candidates,
     simulated,
+    spread_out,
 )
 from sbi_active.criticism.results import UNEXPLAINED, ModelKey, Tracing
-from sbi_active.criticism.steps.predictive import Prediction, predict
+from sbi_active.criticism.steps.predictive import predict
 
 
 def severe_tests(
@@ -51,60 +50,37 @@ def severe_tests(
     if not tracing.chosen:
         return ()
     candidates = permitted_candidates(rivals, actions)
-    few = min(PLAN.max_tests, _affordable(rivals))
-    beyond = extrapolated(actions, candidates, limit=few)
-    # Where every model has a residual process, the bare model has one too.
-    free = ModelKey(error=None if tracing.misfit else UNEXPLAINED)
-    tested = (
-        (_spread_out(candidates, few), True),
-        (simulated(rivals, beyond), False),
-    )
+    m = rivals.measurements
+    # As many as the residual process predicts in memory.
+    most = max(PLAN.max_entries // (len(m) * int(np.prod(m.shape[1:]))), 2)
+    few = min(PLAN.max_tests, most)
+    farther = simulated(rivals, beyond_range(actions, candidates, limit=few))
+    each = ((spread_out(candidates, few), True), (farther, False))
     return tuple(
-        _most_severe(rivals, tracing.key, free, some, is_permitted=is_permitted)
-        for some, is_permitted in tested
+        _most_severe(rivals, tracing, some, is_permitted=is_permitted)
+        for some, is_permitted in each
         if len(some)
     )
 
 
 def _most_severe(
-    rivals: RivalSet,
-    key: ModelKey,
-    residual: ModelKey,
-    candidates: Tensor,
-    *,
-    is_permitted: bool,
+    rivals: RivalSet, tracing: Tracing, candidates: Tensor, *, is_permitted: bool
 ) -> SevereTest:
     trials = following(rivals, candidates)
+    # Where every model has a residual process, the bare model has one too.
+    residual = ModelKey(error=None if tracing.misfit else UNEXPLAINED)
     options = {"num_draws": PLAN.num_draws, "scored": False}
-    verdict = predict(rivals, trials, key=key, **options)
+    verdict = predict(rivals, trials, key=tracing.key, **options)
     free = predict(rivals, trials, key=residual, **options)
-    difference = _difference(verdict, free, len(candidates))
+    (_, sd), (_, spread) = verdict.moments(), free.moments()
+    square = ((free.middle - verdict.middle) ** 2 + spread**2) / sd**2
+    trial, num = verdict.measurements.trial, len(candidates)
+    size = np.maximum(np.bincount(trial, minlength=num), 1)
+    total = np.bincount(trial, square, minlength=num)
+    difference = np.sqrt(np.maximum(total / size - 1, 0.0))
     best = int(np.argmax(difference))
     return SevereTest(
         action=candidates[best].double().numpy(),
         is_permitted=is_permitted,
         difference=float(difference[best]),
     )
-
-
-def _difference(verdict: Prediction, free: Prediction, num: int) -> Array:
-    """Return d of each trial, shape (num,)."""
-    (_, sd), (_, spread) = verdict.moments(), free.moments()
-    square = ((free.middle - verdict.middle) ** 2 + spread**2) / sd**2
-    trial = verdict.measurements.trial
-    total = np.bincount(trial, square, minlength=num)
-    size = np.bincount(trial, minlength=num)
-    return np.sqrt(np.maximum(total / np.maximum(size, 1) - 1, 0.0))
-
-
-def _affordable(rivals: RivalSet) -> int:
-    """Return the number of candidates that the residual process predicts in memory."""
-    m = rivals.measurements
-    return max(PLAN.max_entries // (len(m) * int(np.prod(m.shape[1:]))), 2)
-
-
-def _spread_out(candidates: Tensor, limit: int) -> Tensor:
-    """Return at most so many, evenly in their order, with the first and the last."""
-    if len(candidates) <= limit:
-        return candidates
-    return candidates[torch.linspace(0, len(candidates) - 1, limit).round().long()]

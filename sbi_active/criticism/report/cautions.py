@@ -13,13 +13,13 @@ from sbi_active.criticism.effects.effect import Effect
 from sbi_active.criticism.evidence.rival_set import FEW_TRIALS
 from sbi_active.criticism.forces.library import COUPLING, FAMILY
 from sbi_active.criticism.report.contents import Contents
-from sbi_active.criticism.report.summary import (
+from sbi_active.criticism.report.words import (
     NO_PART,
+    blocks,
     narrow_prior,
     rests,
     suspects_in_words,
 )
-from sbi_active.criticism.report.words import blocks
 from sbi_active.criticism.results import (
     FEW_DRAWS,
     NONE,
@@ -172,16 +172,13 @@ def _at_edge(tracing: Tracing, effects: Sequence[Effect]) -> list[tuple[Effect, 
     return found
 
 
-def _is_extreme(effect: Effect, mean: Array, *, edge: float = 0.99) -> bool:
+def _is_extreme(effect: Effect, mean: Array, *, edge: float = 0.01) -> bool:
     """Return whether phi is further from the null than almost all of its prior."""
+    null = effect.null_phi(1).numpy()[0]
+
+    def away(phi: Array) -> Array:  # from an infinite null the far end is away from it
+        return np.where(np.isfinite(null), np.abs(phi - null), -np.sign(null) * phi)
+
     with forked_generators(0, "edge"):
         draws = effect.sample(2_000).numpy()
-    null = effect.null_phi(1).numpy()[0]
-    finite = np.isfinite(null)
-    center = np.where(finite, null, 0.0)
-    distance, own = np.abs(draws - center), np.abs(mean - center)
-    beyond = (own > np.quantile(distance, edge, axis=0)) & finite
-    # From an infinite null the far end is the one away from it.
-    low, high = np.quantile(draws, [1 - edge, edge], axis=0)
-    far = np.where(null > 0, mean < low, mean > high) & ~finite
-    return bool((beyond | far).any())
+    return bool(((away(draws) > away(mean)).mean(0) < edge).any())

@@ -1,4 +1,4 @@
-"""Figures of a report: residuals, probabilities of effects, error before and after."""
+"""Figures of a report: residuals, and the error before and after."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sbi_active.criticism.report.contents import Contents
-from sbi_active.criticism.report.summary import added
-from sbi_active.criticism.results import Array, Evaluation, Residuals, Tracing
+from sbi_active.criticism.report.words import added
+from sbi_active.criticism.results import Array, Evaluation, Residuals
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -26,7 +26,6 @@ CAPTIONS = {
     "residuals": "Residuals of the models refitted to all trials, in standard "
     "deviations of the prediction; the band is two of them. Each row has its scale, "
     "logarithmic beyond the band where residuals are large.",
-    "probabilities": "Posterior probability of the models that were tried.",
     "before_after": "One line a scored trial; the bars are over all of them. Lower is "
     "better for the first two, higher for the third; the dotted line is 90 %.",
 }
@@ -43,8 +42,6 @@ def figures(report: Contents) -> dict[str, Figure]:
             added=added(report),
         ),
     }
-    if report.has_probabilities:
-        found["probabilities"] = plot_probabilities(report.tracing)
     if report.evaluation is not None:
         found["before_after"] = plot_before_after(report.evaluation)
     return found
@@ -94,39 +91,6 @@ def plot_residuals(
         for ax in line:
             _residual_axis(ax, each)
         line[0].set_ylabel(f"{title}\nresidual [sd]", color=color)
-    return figure
-
-
-def plot_probabilities(tracing: Tracing, *, at_most: int = 14) -> Figure:
-    """Draw the probability of every model, those of the credible set filled.
-
-    Sets of several effects with less than .01 are left out.
-
-    Args:
-        tracing: Tracing to draw.
-        at_most: Bars, the most probable ones.
-
-    Returns:
-        The figure.
-    """
-    kept = {
-        name: p
-        for name, p in tracing.probabilities.items()
-        if p >= 0.01 or not tracing.has_several(name)
-    }
-    names = sorted(kept, key=kept.__getitem__, reverse=True)[:at_most][::-1]
-    values = [kept[name] for name in names]
-    colors = [AFTER if n in tracing.credible_set else "#aab3ba" for n in names]
-    figure, axes = _subplots(1, 1, width=6.0, height=0.5 + 0.26 * len(names))
-    ax = axes[0, 0]
-    ax.barh(names, values, height=0.65, color=colors)
-    for y, value in enumerate(values):
-        text = f"{value:.2f}" if value >= 0.005 else "< 0.01"
-        ax.text(value + 0.01, y, text, va="center", fontsize=8, color="#333333")
-    ax.set(xlim=(0, 1.1), xlabel="posterior probability (filled: credible set)")
-    ax.set_xticks(np.linspace(0, 1, 6))
-    ax.tick_params(axis="y", length=0)
-    _plain(ax)
     return figure
 
 

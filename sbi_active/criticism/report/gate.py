@@ -13,8 +13,7 @@ from typing import Any, Literal
 import numpy as np
 
 from sbi_active.criticism.report.contents import Contents
-from sbi_active.criticism.report.summary import not_told_from
-from sbi_active.criticism.report.words import listed, number, stated
+from sbi_active.criticism.report.words import listed, not_told_from, number, stated
 from sbi_active.criticism.results import NONE, OUTLIER, ModelKey
 
 Decision = Literal[

@@ -16,8 +16,12 @@ from sbi_active.criticism.report.cautions import cautions
 from sbi_active.criticism.report.contents import Contents
 from sbi_active.criticism.report.figures import figures
 from sbi_active.criticism.report.gate import Gate, gate_of
-from sbi_active.criticism.report.sections import cautions_with_codes, head, page
-from sbi_active.criticism.report.tables import tables_of
+from sbi_active.criticism.report.sections import (
+    cautions_with_codes,
+    head,
+    page,
+    tables_of,
+)
 from sbi_active.criticism.results import NONE, Evaluation
 from sbi_active.criticism.steps.predictive import find_residuals
 from sbi_active.display.figures import legible

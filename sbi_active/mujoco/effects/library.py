@@ -11,7 +11,7 @@ import torch
 from sbi_active.criticism.data.trials import Trials
 from sbi_active.criticism.effects.augmented import AugmentedSimulator
 from sbi_active.criticism.effects.effect import Context, Effect
-from sbi_active.criticism.effects.patterns import picked
+from sbi_active.criticism.effects.table import picked
 from sbi_active.expected import suggests
 from sbi_active.mujoco.effects.changes import QuantityChange
 from sbi_active.mujoco.effects.elements import elements
@@ -70,14 +70,16 @@ def mjcf_effects(
 def likely_effects(robot: Robot) -> list[Effect]:
     """Return effects that joints and drives most often have and an MJCF does not say.
 
+    Some may change nothing in the recordings.
+
     Args:
         robot: Robot from its MJCF, with recordings.
     """
-    simulator, every, call = _offered(robot, None)
+    simulator, every, _ = _offered(robot, None)
     likely = ("* friction loss", "* quadratic damping", "* stiffness", "* lag")
     fitted_by_these = ("* sensor lag", "* cubic *", "* quadratic stiffness", "all *")
     some = picked(every, likely, fitted_by_these, strict=False)
-    return _that_matter(simulator, some, call)
+    return _undeclared(simulator, some)
 
 
 def _offered(
@@ -103,17 +105,9 @@ def _offered(
     return simulator, every, call
 
 
-def _that_matter(
-    simulator: SimulatorModel, effects: Sequence[Effect], call: dict[str, Any]
-) -> list[Effect]:
-    """Return the effects that are no parameter and change the readings."""
+def _undeclared(simulator: SimulatorModel, effects: Sequence[Effect]) -> list[Effect]:
+    """Return the effects of quantities that are no parameters."""
     function: MujocoFunction = simulator.fn  # pyright: ignore[reportAssignmentType]
-    bare = simulator.without_noise()
-    theta, action = call["theta"], call["action"]
-    context = Context(
-        index=torch.arange(len(theta), dtype=torch.float64),
-        **{k: v for k, v in call.items() if k not in ("theta", "action")},
-    )
     declared = {p.quantity for p in function.machines[0].parameters}
     new = []
     for effect in effects:
@@ -121,6 +115,20 @@ def _that_matter(
         is_new = not isinstance(change, QuantityChange)
         if is_new or not {*change.quantities} <= declared:
             new.append(effect)
+    return new
+
+
+def _that_matter(
+    simulator: SimulatorModel, effects: Sequence[Effect], call: dict[str, Any]
+) -> list[Effect]:
+    """Return the effects that are no parameter and change the readings."""
+    bare = simulator.without_noise()
+    theta, action = call["theta"], call["action"]
+    context = Context(
+        index=torch.arange(len(theta), dtype=torch.float64),
+        **{k: v for k, v in call.items() if k not in ("theta", "action")},
+    )
+    new = _undeclared(simulator, effects)
     augmented = AugmentedSimulator(bare, new)
     x = augmented.evaluate(theta, {}, action, context=context)
     least = 1e-9 * (float(np.nanstd(x.double().numpy())) or 1.0)

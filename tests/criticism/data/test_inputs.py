@@ -162,7 +162,11 @@ def test_inputs_come_from_another_file_on_their_own_grid():
 @pytest.mark.parametrize(
     ("rows", "column", "message"),
     [
-        (["a,0,1,5", "a,1,2,5"], "action_u", "1.0 in row 1 and 2.0 in row 2 .*input_"),
+        (
+            ["a,0,1,5", "a,1,2,5"],
+            "action_u",
+            r"action_u, row 2 \(trial a\); got 2.0 after 1.0 .*input_",
+        ),
         (
             ["a,0,1,5", "a,1,1,5", "a,2,1,5", "a,9,1,5", "a,10,1,5"],
             "input_u",

@@ -10,7 +10,7 @@ import torch
 from benchmarks.robots.models import SPRING_MASS
 from sbi_active.criticism import Trials
 from sbi_active.criticism.data import Measurements
-from sbi_active.criticism.data.units import to_si
+from sbi_active.criticism.data.columns import to_si
 from sbi_active.mujoco import from_mjcf
 
 

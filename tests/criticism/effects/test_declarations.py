@@ -21,7 +21,7 @@ from sbi_active.criticism import (
     generic_effects,
     joint_prior,
 )
-from sbi_active.criticism.effects.declarations import require_nested
+from sbi_active.criticism.effects.effect import require_nested
 from tests.effects import effect
 
 NAN, NORMAL = float("nan"), Normal(0.0, 1.0)
@@ -40,8 +40,8 @@ def loop(*effects, model=MODEL):
     ("changes", "message"),
     [
         ({"null": NAN}, "expected a null of effect 'bias'; got NaN"),
-        ({"null": [0.0, 0.0]}, r"expected a null of shape \(1,\)"),
-        ({"prior": 1.0}, "expected a torch distribution as prior of effect 'bias'"),
+        ({"null": [0.0, 0.0]}, r"expected a null of effect 'bias' of shape \(1,\)"),
+        ({"prior": 1.0}, "expected a continuous torch prior of effect 'bias'"),
         (
             {"prior": TransformedDistribution(Normal(0.0, 1.0), [PowerTransform(0.5)])},
             "expected finite draws from the prior of effect 'bias'; got NaN or inf",

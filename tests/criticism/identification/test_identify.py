@@ -221,3 +221,25 @@ def test_a_prior_of_any_shape_counts():
     assert [*belief.interval()["nothing"]] == pytest.approx(expected, abs=0.12)
     low, high = belief.interval(0.999)["frequency"]
     assert low < 3.0 < high
+
+
+def test_small_matrices_are_not_shared_by_threads():
+    """A second thread spins: it made three of four CPU seconds of a robot's belief."""
+    before, seen = torch.get_num_threads(), []
+
+    def decay(theta, action):
+        seen.append(torch.get_num_threads())
+        return action * torch.exp(-theta * torch.arange(20) / 10)
+
+    model = SimulatorModel(decay, sample_times=torch.arange(20) / 10)
+    action = torch.tensor([[1.0], [2.0], [3.0]])
+    x = decay(torch.full((3, 1), 0.5), action) + 0.01 * torch.randn(3, 20)
+    seen.clear()
+    prior = BoxUniform(torch.zeros(1), torch.ones(1))
+    torch.set_num_threads(2)
+    try:
+        identify(model, prior, Trials(action, x))
+        assert {*seen} == {1}
+        assert torch.get_num_threads() == 2
+    finally:
+        torch.set_num_threads(before)

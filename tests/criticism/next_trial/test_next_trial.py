@@ -12,8 +12,11 @@ from torch.distributions import Normal
 from sbi_active import DiscreteActions, GaussianNoise, SimulatorModel
 from sbi_active.criticism import Criticism, Trials
 from sbi_active.criticism.next_trial import next_action
-from sbi_active.criticism.next_trial.candidates import extrapolated
-from sbi_active.criticism.next_trial.next_action import PredictedRival, choose_action
+from sbi_active.criticism.next_trial.next_action import (
+    PredictedRival,
+    beyond_range,
+    choose_action,
+)
 from sbi_active.criticism.results import ModelKey
 from sbi_active.design.estimators.model_index import ModelIndexGain, RivalSampler
 from tests.criticism.misfit.oscillator import ACTION, EFFECTS, trials
@@ -145,7 +148,7 @@ def test_a_simulator_that_fails_outside_its_range_names_nothing():
 )
 def test_extrapolated_actions_keep_their_sign(values, farthest, sign):
     actions = DiscreteActions(values)
-    found = extrapolated(actions, actions.values, limit=16)[:, 0]
+    found = beyond_range(actions, actions.values, limit=16)[:, 0]
     assert not bool(actions.contains(found[:, None]).any())
     assert float(found.abs().max()) == pytest.approx(farthest)
     assert bool((sign * found >= 0).all())

@@ -7,7 +7,7 @@ from sbi.utils import BoxUniform
 
 from sbi_active import DiscreteActions, GaussianNoise, SimulatorModel
 from sbi_active.criticism import Criticism, Trials, generic_effects
-from sbi_active.criticism.next_trial.candidates import extrapolated, following
+from sbi_active.criticism.next_trial.next_action import beyond_range, following
 from sbi_active.criticism.next_trial.severe_tests import severe_tests
 from sbi_active.criticism.steps.predictive import predict
 from tests.effects import BIAS
@@ -67,7 +67,7 @@ def test_a_confident_alias_is_told_as_what_it_is(aliased):
 def test_the_verdict_fails_most_where_it_is_put_to_the_test(aliased):
     inside, beyond = severe_tests(aliased.rivals, aliased.trace(), ANGLES)
     assert (inside.is_permitted, beyond.is_permitted) == (True, False)
-    others, key = extrapolated(ANGLES, ANGLES.values, limit=16), aliased.trace().key
+    others, key = beyond_range(ANGLES, ANGLES.values, limit=16), aliased.trace().key
     for found, candidates in ((inside, ANGLES.values), (beyond, others)):
         trials = following(aliased.rivals, candidates)
         mean, _ = predict(aliased.rivals, trials, key=key, scored=False).moments()

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 import torch
 from matplotlib import image
-from matplotlib.colors import to_hex
 from sbi.utils import BoxUniform
 
 from sbi_active.criticism import joint_prior
@@ -17,7 +16,6 @@ from sbi_active.criticism.contradictions import SevereTest
 from sbi_active.criticism.report.figures import (
     AFTER,
     BEFORE,
-    plot_probabilities,
     plot_residuals,
 )
 from sbi_active.criticism.report.sections import head
@@ -96,7 +94,7 @@ def test_a_report_pickles_with_effects_that_are_local_functions():
 def test_the_page_is_self_contained():
     elements = Parsed(report().to_html()).elements
     images = [attributes["src"] for tag, attributes in elements if tag == "img"]
-    assert len(images) == 3
+    assert len(images) == 2
     assert all(source.startswith("data:image/svg+xml;base64,") for source in images)
     assert all(own.get("href", "#").startswith("#") for _, own in elements)
     assert not any(tag == "script" and "src" in own for tag, own in elements)
@@ -114,12 +112,12 @@ def test_markdown_tables_have_as_many_cells_as_headings():
 
 def test_save_writes_the_page_and_every_figure(tmp_path):
     page = report().save(tmp_path / "out")
-    pictures = {"residuals.png", "probabilities.png", "before_after.png"}
+    pictures = {"residuals.png", "before_after.png"}
     names = {path.name for path in page.parent.iterdir()}
     assert names == {"report.txt", "report.md", "report.html"} | pictures
     linked = re.findall(r"\]\((.+?)\)", (page.parent / "report.md").read_text())
     assert {*linked} == pictures
-    assert page.read_text().count("data:image/svg+xml;base64,") == 3
+    assert page.read_text().count("data:image/svg+xml;base64,") == 2
     for name in pictures:
         assert image.imread(page.parent / name).std() > 0.01  # something is drawn
 
@@ -147,15 +145,3 @@ def test_every_residual_is_drawn_at_its_action_its_trial_and_its_channel(num):
             expected = sorted(zip(place, made.refitted.ravel(), strict=True))
             np.testing.assert_allclose(points(ax), expected)
             assert {line.get_color() for line in ax.lines[:num]} == {color}
-
-
-def test_bars_are_as_long_as_probabilities_the_most_probable_on_top():
-    shares = {"drag": 0.6, "tilt": 0.33, "drag + tilt": 0.015, "none": 0.001}
-    shares |= {"drag + bias": 0.004, "scatter": 0.05}
-    found = tracing(probabilities=shares, credible_set=("drag", "tilt"))
-    (ax,) = plot_probabilities(found).axes
-    names = [label.get_text() for label in ax.get_yticklabels()]
-    assert names == ["none", "drag + tilt", "scatter", "tilt", "drag"]  # upwards
-    assert [bar.get_width() for bar in ax.patches] == [shares[n] for n in names]
-    filled = [to_hex(bar.get_facecolor()) == AFTER for bar in ax.patches]
-    assert filled == [name in ("drag", "tilt") for name in names]
