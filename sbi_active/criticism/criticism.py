@@ -308,7 +308,7 @@ class Criticism:
             evaluation: The error before and after; None if not requested.
         """
         tracing = self.trace()  # which the posteriors of the models come with
-        return judged(self.rivals, tracing, evaluation)
+        return judged(self._verdict, self.rivals, tracing, evaluation)
 
     def report(
         self,

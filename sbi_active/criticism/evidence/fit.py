@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -58,8 +58,6 @@ class Fit:
         evidence: Evidence that is recorded of it.
         best: Point from which other trials are predicted, shape (dim,); None takes the
             draws.
-        mode: Point at which it is linear, or of the largest density of a sample, shape
-            (dim,); None where effects on the noise are drawn beside it.
         linear: Function from u (n, dim) to the residuals (n, N) of the linear model
             that draws are of; None if they are of the simulator's own posterior.
         known: Mask of the numbers that it is fitted to, shape (N,); None for all.
@@ -70,7 +68,6 @@ class Fit:
     sample: WeightedDraws
     evidence: Evidence
     best: Array | None = None
-    mode: Array | None = None
     linear: Callable[[Array], Array] | None = None
     known: NDArray[np.bool_] | None = None
     spread: Spread | None = None
@@ -84,13 +81,26 @@ class Fit:
         assert isinstance(error, NoiseGrid)  # a process joins all of them
         return error.part(self.known)
 
-    @property
-    def point(self) -> Array:
-        """The point from which one prediction is made, shape (dim,)."""
-        if self.best is not None:
-            return self.best
-        own = self.sample
-        return own.u[int(np.argmax(own.weight))] if self.mode is None else self.mode
+    def by(self, known: NDArray[np.bool_]) -> Fit:
+        """Return a sampled model with its posterior by some of the numbers.
+
+        What bends has no linear model that could be fitted again; its draws are weighed
+        by the density of the other numbers.
+
+        Args:
+            known: Mask of the numbers that count, shape (N,).
+        """
+        own, some = self.sample, replace(self, known=known)
+        residual, log_scale, _ = self.rival.residual(own.u, penalized=False)
+        lost = np.broadcast_to(log_scale, residual.shape)[:, ~known].sum(1)
+        log_w = np.log(np.maximum(own.weight, 1e-300)) + lost
+        log_w += some.error.log_likelihood(residual[:, known])
+        log_w -= self.error.log_likelihood(residual)
+        log_w = np.where(np.isfinite(log_w), log_w, -np.inf)
+        effective = effective_sample_size(log_w)
+        weight = normalized(log_w)
+        own = replace(own, weight=weight, effective_sample_size=effective)
+        return replace(some, sample=own)
 
     def weighed(
         self, u: Array, residual: Array, rng: np.random.Generator
@@ -129,44 +139,13 @@ def tempered(log_w: Array, fewest: float) -> Array:
     return normalized(power * log_w)
 
 
-#: Searches from draws of the prior alone. A wrong model explains nothing, so that no
-#: number of searches is asked to.
+#: Searches of modes. A wrong model explains nothing, so that no number of searches is
+#: asked to.
 THOROUGH = SearchSettings(
     num_screened=128, max_starts=48, explained=0.0, phases=10, num_kept=8
 )
-#: Searches with a fit to begin at.
-NESTED = SearchSettings(
-    num_screened=32,
-    num_starts=4,
-    max_starts=12,
-    num_found=1,
-    explained=0.0,
-    iterations=6,
-    phases=10,
-)
 
 
-def settings_of(num_trials: int, *, is_bare: bool) -> Settings:
-    """Return the settings of what is spent on a model.
-
-    The bare model is every comparison's other side, and its posterior is shown; an
-    evidence that is off by a seventh of a nat decides as well as a better one.
-
-    Args:
-        num_trials: Number of simulated trials in a row.
-        is_bare: Whether it is the model without effects.
-    """
-    most = 3_000  # rows of all trials
-    if is_bare:
-        return Settings(plenty=4.0, num_simulations=3 * most * num_trials)
-    return Settings(
-        num_effective=50.0,
-        plenty=1.0,
-        divergence=np.inf,
-        num_draws=100,
-        fewest=25.0,
-        affordable=5.0,
-        broad=60.0,
-        share_of_plenty=0.0,
-        num_simulations=most * num_trials,
-    )
+def settings_of(num_trials: int) -> Settings:
+    """Return the settings of a sample: 9,000 rows of so many simulated trials."""
+    return Settings(plenty=4.0, num_simulations=9_000 * num_trials)

@@ -15,7 +15,7 @@ from sbi_active.criticism.data.trials import Trials
 from sbi_active.criticism.evidence.rival_set import RivalSet
 from sbi_active.criticism.linear.search import Search
 from sbi_active.criticism.misfit.contrary import is_left_to_chance, withdrawn
-from sbi_active.criticism.misfit.draws import posterior
+from sbi_active.criticism.misfit.draws import posterior, shown
 from sbi_active.criticism.misfit.guesses import guess_residual
 from sbi_active.criticism.misfit.scored import weights_by_error
 from sbi_active.criticism.misfit.verdict import Verdict
@@ -141,13 +141,9 @@ def _missing(
 
 
 def _with_posteriors(found: Verdict, keys: Sequence[ModelKey]) -> RivalSet:
-    """Return the models with the posteriors of some of them.
-
-    The bare model's comes first: what nobody declared is sized by its residual.
-    """
-    models, bare = found.rivals, ModelKey()
-    models = models.with_fits({bare: posterior(found, models, bare)})
-    fits = {key: posterior(found, models, key) for key in dict.fromkeys(keys)}
+    """Return the models with the posteriors of some of them, as they are shown."""
+    models = found.rivals
+    fits = {k: shown(found, posterior(found, models, k)) for k in dict.fromkeys(keys)}
     return models.with_fits(fits)
 
 
