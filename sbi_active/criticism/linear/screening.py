@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import combinations
 
 import numpy as np
 
@@ -97,13 +96,10 @@ def _scores(library: Library) -> dict[str, float]:
 
     It is that of the effect alone, or in a pair that is better than either member.
     """
-    library.look_at_each()
-    singles = {n: library.score((n,)) for n in library.names}
+    singles = {n: value for (n,), value in library.scores(library.names, 1).items()}
     ranked = sorted(singles, key=singles.__getitem__)[::-1]
     paired, best = [n for n in library.names if n in ranked[:PAIRED]], dict(singles)
-    library.prepare(paired)
-    for pair in combinations(paired, 2):
-        value = library.score(pair)
+    for pair, value in library.scores(paired, 2).items():
         if value > max(singles[name] for name in pair):
             best |= {name: max(best[name], value) for name in pair}
     return best

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
@@ -276,13 +275,9 @@ class Search:
             return {}
         names = [n for n in self.names if n not in base.effects and not self._free(n)]
         library = self._library_of(base, names) if base.effects else self.library
-        library.prepare(names)
-        found = {}
-        for new in combinations(names, size - len(base.effects)):
-            key = self._joined(base, new)
-            if key not in self.found:
-                found[key] = library.score(new)
-        return found
+        scores = library.scores(names, size - len(base.effects))
+        found = {self._joined(base, new): value for new, value in scores.items()}
+        return {key: value for key, value in found.items() if key not in self.found}
 
     def _library_of(self, base: ModelKey, names: Sequence[str]) -> Library:
         """Return a model with columns of effects that it lacks."""

@@ -24,7 +24,6 @@ from sbi_active.arrays import Array
 from sbi_active.criticism.effects.effect import Effect
 from sbi_active.criticism.linear.left_out import Candidate
 from sbi_active.criticism.linear.mixture import WIDTHS, Mixture, summed
-from sbi_active.criticism.linear.model import LinearModel
 from sbi_active.criticism.linear.search import Search
 from sbi_active.criticism.results import OUTLIER, SCATTER, UNEXPLAINED, ModelKey
 from sbi_active.criticism.rivals.validity import (
@@ -279,7 +278,7 @@ class States:
         """
         model = self.search.model(self.predicting(key))
         _, freedom, p = model.chi_square
-        square = self.square(model)
+        square = self.square(model.residual[: model.num])
         if is_louder := bool(self.louder(key)):
             residual = model.residual[: model.num] / self.louder_draws(key)[1]
             square = float((self._innovations(residual) ** 2).sum(1).min())
@@ -287,9 +286,9 @@ class States:
             p = float(chi2.sf(square, freedom))
         return square, p
 
-    def square(self, model: LinearModel) -> float:
-        """Return the sum of a model's squares, in variances of the sensor."""
-        return float((self._innovations(model.residual[: model.num]) ** 2).sum())
+    def square(self, residual: Array) -> float:
+        """Return the sum of the squares of residuals (N,) in sensor deviations."""
+        return float((self._innovations(residual) ** 2).sum())
 
     @property
     def _is_correlated(self) -> bool:

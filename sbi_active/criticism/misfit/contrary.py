@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from copy import copy
 from dataclasses import replace
 
 import numpy as np
@@ -15,9 +14,6 @@ from sbi_active.criticism.contradictions import BoundParameter, Bounds
 from sbi_active.criticism.evidence.fit import Fit
 from sbi_active.criticism.evidence.rival_set import RivalSet
 from sbi_active.criticism.forces.library import is_force
-from sbi_active.criticism.linear.fits import polished
-from sbi_active.criticism.linear.model import LinearModel
-from sbi_active.criticism.linear.search import Search
 from sbi_active.criticism.misfit.verdict import Verdict
 from sbi_active.criticism.results import (
     CATCH_ALLS,
@@ -28,9 +24,11 @@ from sbi_active.criticism.results import (
     ModelKey,
     Tracing,
 )
+from sbi_active.criticism.rivals.error_models import Whitener
 from sbi_active.criticism.rivals.rival import Rival
 from sbi_active.criticism.steps.detection import LEVEL, THRESHOLD
 from sbi_active.criticism.under_misfit import Misfit
+from sbi_active.inference.sampling.least_squares import descend
 
 #: Score of trials that speaks against effects.
 DENSITY = "log predictive density"
@@ -207,26 +205,34 @@ def beyond_bounds(found: Verdict, rivals: RivalSet, tracing: Tracing) -> Tracing
     keys, own = {ModelKey(): ModelKey()}, found.states.predicting(tracing.key)
     if tracing.key in rivals.fits:
         keys.setdefault(own, tracing.key)
-    models = {key: found.model(key) for key in keys}
+    fits = {key: found.model(key).u for key in keys}
     sides = {key: _sides(rivals.fits[known]) for key, known in keys.items()}
-    last = [*models.values()][-1]
-    bounds, known = Bounds(), found.search.sensor.is_known
-    square = found.states.square(last)
-    size = square / last.chi_square[1]
+    if not any(side.any() for side in sides.values()):
+        return _unless_none(tracing, Bounds())
+    (last, u), rival = [*fits.items()][-1], rivals.rival(own)
+    whiten = rivals.noise.whitener(rival.residual(u[None])[0][0])  # errors may last
+    best = _refitted(rivals, rivals.rival(last), whiten, [u])
+    assert best is not None
+    square, bounds, dim = best[1], Bounds(), rival.theta_dim
+    spare = max(rival.num_observed - rival.dim, 1)
     for key, side in sides.items():
         if not side.any():
             continue
-        rival = _moved(found.search.rival(key), side)
-        again = _refitted(found.search, rival, [models[key], last])
-        held = _held(rivals, models[key], side, rival, again)
+        rival, point = _moved(rivals.rival(key), side), fits[key]
+        starts = [point, np.r_[u[:dim], point[dim:]]]
+        again = _refitted(rivals, rival, whiten, starts)
+        held = _held(rivals, side, rival, again)
         bounds = replace(bounds, parameters=(*bounds.parameters, *held))
         if key != ModelKey() or again is None or not held:
             continue
-        rest = found.states.square(again)
-        if known:
-            p_value = float(chi2.sf(rest, again.chi_square[1]))
-            bounds, size = replace(bounds, p_value=p_value), max(size, 1.0)
-        if tracing.chosen and rest - square < 2 * THRESHOLD * size:
+        if found.search.sensor.is_known:
+            rest = rival.residual(again[0][None])[0][0] / found.search.unit
+            freedom = max(len(rest) - rival.dim, 1)
+            p_value = float(chi2.sf(found.states.square(rest), freedom))
+            bounds = replace(bounds, p_value=p_value)
+        if tracing.chosen and again[1] - square < 2 * THRESHOLD * max(
+            square / spare, 1.0
+        ):
             bounds = replace(bounds, replaces=str(ModelKey(tracing.chosen)))
     return _unless_none(tracing, bounds)
 
@@ -265,8 +271,7 @@ def _moved(rival: Rival, side: NDArray[np.int64]) -> Rival:
     simulator. A positive parameter keeps its sign and a tenth of its bound, since a
     simulator may not know what a negative friction is.
     """
-    rival, c = copy(rival), copy(rival.coordinates)
-    rival.coordinates = c
+    c = rival.coordinates
     zero, width = -c.shift / c.scale, c.high - c.low
     c.low, c.high = c.low.copy(), c.high.copy()
     for k in np.flatnonzero(side):
@@ -280,39 +285,40 @@ def _moved(rival: Rival, side: NDArray[np.int64]) -> Rival:
 
 
 def _refitted(
-    search: Search, rival: Rival, near: Sequence[LinearModel]
-) -> LinearModel | None:
-    """Return the best fit of a rival whose bounds moved; None if there is none.
+    rivals: RivalSet, rival: Rival, whiten: Whitener, starts: Sequence[Array]
+) -> tuple[Array, float] | None:
+    """Return the best fit of a rival and its squares; None if the simulator has none.
 
-    It begins at the fit within them, and at the parameters of another model.
+    Without a derivative nothing is fitted again.
     """
-    if not search.rivals.is_smooth:
-        return None  # without a derivative nothing is fitted again
-    starts = np.stack([near[0].u, near[0].u])
-    starts[1, : rival.theta_dim] = near[1].u[: rival.theta_dim]
+    if not rivals.is_smooth:
+        return starts[0], np.inf
+    given = np.stack(starts), whiten, rivals.step
     try:
-        fits = [polished(rival, u, search.units, search.settings) for u in starts]
+        u, cost = descend(rival, *given, 30)
     except (ArithmeticError, RuntimeError, ValueError):
         return None  # a simulator may refuse what its prior excludes
-    return min(fits, key=lambda fit: fit.cost)
+    u = u[np.argmin(cost)]
+    return u, float((whiten(rival.residual(u[None])[0][0]) ** 2).sum())
 
 
 def _held(
     rivals: RivalSet,
-    model: LinearModel,
     side: NDArray[np.int64],
     rival: Rival,
-    again: LinearModel | None,
+    again: tuple[Array, float] | None,
 ) -> list[BoundParameter]:
     """Return the parameters of a model at bounds, and where they are beyond them.
 
     One that stays inside though its bound was moved is not held by it.
     """
-    c = rival.coordinates
-    z = np.full(c.dim, np.nan) if again is None else c.to_z(again.u[None])[0]
+    before, c = rivals.rival(rival.key).coordinates, rival.coordinates
+    z = np.full(c.dim, np.nan)
+    if again is not None and rivals.is_smooth:
+        z = c.to_z(again[0][None])[0]
     names, found = rivals.names_of(rival), []
     for k in np.flatnonzero(side).tolist():
-        ends = model.low if side[k] < 0 else model.high
+        ends = before.low if side[k] < 0 else before.high
         bound = c.to_z(np.where(np.isfinite(ends), ends, 0.0)[None])[0, k]
         if side[k] * (z[k] - bound) <= 0:
             continue
