@@ -9,8 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sbi_active.arrays import Array
+from sbi_active.criticism.data.measurements import Measurements
 from sbi_active.criticism.results import Evidence
-from sbi_active.criticism.rivals.error_models import NoiseGrid
+from sbi_active.criticism.rivals.error_models import NoiseCell, NoiseGrid
 from sbi_active.criticism.rivals.residual_process import ResidualProcess
 from sbi_active.criticism.rivals.rival import Rival
 from sbi_active.inference.engine import WeightedDraws
@@ -32,10 +33,12 @@ class Spread:
         size: Root mean square residual of each channel, in units of x, shape (c,).
         square: Mean squared error of each left-out part, in units of what both expect
             of it, shape (f,).
+        time: Correlation time of the errors, in the unit of the sample times.
     """
 
     size: Array
     square: Array
+    time: float = 0.0
 
     @property
     def scale(self) -> float:
@@ -46,6 +49,12 @@ class Spread:
     def sizes(self) -> Array:
         """Standard deviation of errors given the parameters by channel, shape (c,)."""
         return self.scale * self.size
+
+    def errors(self, m: Measurements, num: int, rng: np.random.Generator) -> Array:
+        """Return errors of some numbers at random, shape (n, N)."""
+        given = {"sd": self.sizes[m.channel], "correlation_time": self.time}
+        cells = np.zeros(num, dtype=np.intp)
+        return NoiseGrid([NoiseCell.of(m, **given)]).errors(cells, np.ones(num), rng)[0]
 
 
 @dataclass(frozen=True)

@@ -31,8 +31,8 @@ def posterior(
     """Return a model with draws of its posterior.
 
     The bare model and that of the verdict have samples of the simulator's own posterior
-    where they bend and no model misses; of few effective draws a linear model's, since
-    a few would claim to know what is open.
+    where they bend and do not miss; of few effective draws a linear model's, since a
+    few would claim to know what is open.
 
     Args:
         found: Verdict with the model.
@@ -47,8 +47,8 @@ def posterior(
         if whole is not None and whole.evidence.engine != "linear":
             return whole.by(use[search.errors.fold])
         return _linear(found, models, key, use)
-    is_sampled = not found.is_missed and key in search.found
-    if is_sampled and key in (ModelKey(), found.key) and bends(search, key):
+    is_shown = key in (ModelKey(), found.key) and key in search.found
+    if is_shown and not found.misses(key) and bends(search, key):
         fit = models.sampled(key, search.model(key).u[None])
         if fit.evidence.effective_sample_size >= FEW_DRAWS:
             log_z = found.states.log_evidence(key)
@@ -185,7 +185,8 @@ def spread_of(
     square = m.by_channel((search.unit * rows[:, 0]) ** 2)
     square = np.maximum(square, tiny * m.by_channel(search.unit**2))
     count = np.bincount(fold[kept], minlength=len(told))[told]
-    return Spread(np.sqrt(square), total / count)
+    time = errors.process(own.beside)[1] if found.timed else 0.0
+    return Spread(np.sqrt(square), total / count, time)
 
 
 def _residual(unit: Array, model: LinearModel, u: Array) -> Array:

@@ -7,11 +7,11 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from scipy.stats import chi2
 
 from sbi_active.arrays import Array
 from sbi_active.criticism.data.trials import Trials
 from sbi_active.criticism.evidence.rival_set import RivalSet
+from sbi_active.criticism.linear.fits import sensor_of
 from sbi_active.criticism.misfit.draws import posterior
 from sbi_active.criticism.misfit.verdict import Verdict
 from sbi_active.criticism.results import (
@@ -22,7 +22,7 @@ from sbi_active.criticism.results import (
     ModelKey,
     Tracing,
 )
-from sbi_active.criticism.steps.missed_trials import LEVEL, missed_trials
+from sbi_active.criticism.steps.missed_trials import LEVEL, missed_trials, tails_of
 from sbi_active.criticism.steps.predictive import NUM_DRAWS, Prediction, predict
 from sbi_active.progress import stage
 from sbi_active.simulation import GaussianNoise
@@ -55,10 +55,16 @@ def evaluate_held_out(
     num = len(held_out)
     scored, selected = (scores(before), scores(after)), (tracing.verdict,) * num
     found = summary("held out", np.arange(num), *scored, selected, held_out.names)
-    missed = missed_trials(rivals, tracing, held_out, before, after, level=level)
+    sensor = None
+    if rivals.model.noise is not None:
+        square = rivals.measurements.by_channel(sensor_of(rivals).unit ** 2)
+        sensor = np.sqrt(square)
+    own = tracing, held_out, before, after
+    missed = missed_trials(*own, sensor=sensor, level=level)
     has_size = len(rivals.noise.scales) == 1
     if has_size and isinstance(rivals.model.noise, GaussianNoise):
-        found = replace(found, p_value=tail(after))
+        every = np.zeros(len(after.measurements), dtype=np.int64)
+        found = replace(found, p_value=float(tails_of(after, every)[0]))
     return replace(found, missed=missed)
 
 
@@ -123,21 +129,6 @@ def _predicting(found: Verdict, key: ModelKey) -> ModelKey:
     if not scatters or found.is_missed or found.states.louder(key):
         return ModelKey(key.effects)
     return ModelKey(key.effects, SCATTER)
-
-
-def tail(prediction: Prediction) -> float:
-    r"""Return the tail probability of :math:`e^T (S + R)^{-1} e`.
-
-    S is the covariance of the predictions over the posterior, and R that of the noise,
-    whose errors are taken as independent.
-
-    Args:
-        prediction: Prediction of some trials that were measured.
-    """
-    off = prediction.mean - prediction.mean.mean(0)
-    cov = off.T @ off / (len(off) - 1) + np.diag((prediction.sd**2).mean(0))
-    error = prediction.measurements.x - prediction.middle
-    return float(chi2.sf(error @ np.linalg.solve(cov, error), len(error)))
 
 
 def scores(prediction: Prediction) -> dict[str, Array]:

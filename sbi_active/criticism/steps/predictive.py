@@ -228,14 +228,14 @@ def predict(
     if errs is not None:
         extra = errs.sizes[m.channel]
         sd = np.zeros(mean.shape) if spread is None else np.where(missing, spread, 0.0)
-        errors = sd * rng.normal(size=mean.shape)
+        errors = errs.errors(m, num_draws, rng) + sd * rng.normal(size=mean.shape)
     else:
         assert own_residual is not None
         cells, sizes = fit.error.noise_posterior(own_residual, rng)
         errors, sd = noise.errors(cells, sizes, rng)
         errors, sd = errors * factor, sd * factor
+        errors = errors + extra * rng.normal(size=mean.shape)
     sd = np.sqrt(sd**2 + extra**2)
-    errors = errors + extra * rng.normal(size=mean.shape)
     each = np.empty((num_draws, len(target) if scored else 0))
     for t in range(each.shape[1]):
         at = (m.trial == t) & ~drops
