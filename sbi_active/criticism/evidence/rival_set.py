@@ -18,8 +18,13 @@ from sbi_active.criticism.data.measurements import Measurements
 from sbi_active.criticism.data.trials import Trials
 from sbi_active.criticism.effects.augmented import AugmentedSimulator
 from sbi_active.criticism.effects.effect import Effect
-from sbi_active.criticism.evidence.fit import THOROUGH, Fit, settings_of
-from sbi_active.criticism.evidence.jumps import STEPS, look_for_jumps
+from sbi_active.criticism.evidence.fit import (
+    STEPS,
+    THOROUGH,
+    Fit,
+    look_for_jumps,
+    settings_of,
+)
 from sbi_active.criticism.results import SCATTER, UNEXPLAINED, Evidence, ModelKey
 from sbi_active.criticism.rivals.coordinates import SearchCoordinates
 from sbi_active.criticism.rivals.error_models import NoiseGrid

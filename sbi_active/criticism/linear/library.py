@@ -13,7 +13,7 @@ from sbi_active.criticism.linear.errors import Errors
 from sbi_active.criticism.linear.mixture import Mixture, either
 from sbi_active.criticism.linear.model import LinearModel
 from sbi_active.criticism.results import ModelKey
-from sbi_active.criticism.steps.tracing import log_prior
+from sbi_active.criticism.steps.detection import log_prior
 
 
 class Library:

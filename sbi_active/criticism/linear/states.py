@@ -26,7 +26,7 @@ from sbi_active.criticism.linear.left_out import Candidate
 from sbi_active.criticism.linear.mixture import WIDTHS, Mixture, summed
 from sbi_active.criticism.linear.search import Search
 from sbi_active.criticism.results import OUTLIER, SCATTER, UNEXPLAINED, ModelKey
-from sbi_active.criticism.rivals.validity import (
+from sbi_active.criticism.rivals.rival import (
     DISAGREEMENT,
     UNKNOWN_RATES,
     log_outcomes,

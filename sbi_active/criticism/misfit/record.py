@@ -27,14 +27,13 @@ from sbi_active.criticism.results import (
     Tracing,
 )
 from sbi_active.criticism.rivals.trial_simulator import TrialSimulator
-from sbi_active.criticism.steps.detection import THRESHOLD
+from sbi_active.criticism.steps.detection import THRESHOLD, credible_set
 from sbi_active.criticism.steps.equivalence import (
     equivalent_effects,
     every_action,
     noise_unit,
 )
 from sbi_active.criticism.steps.predictive import predict
-from sbi_active.criticism.steps.tracing import credible_set
 from sbi_active.criticism.under_misfit import Misfit as Found
 from sbi_active.criticism.under_misfit import ModelError
 from sbi_active.seeding import derive_seed

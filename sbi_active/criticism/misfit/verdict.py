@@ -36,9 +36,8 @@ from sbi_active.criticism.results import (
     Detection,
     ModelKey,
 )
-from sbi_active.criticism.steps.detection import LEVEL, THRESHOLD
+from sbi_active.criticism.steps.detection import LEVEL, RESCALED, THRESHOLD
 from sbi_active.criticism.steps.missed_trials import outlying_trials
-from sbi_active.criticism.steps.tracing import RESCALED
 from sbi_active.inference.sampling.weights import log_sum_exp
 
 
@@ -49,19 +48,13 @@ def judge(
 ) -> Verdict:
     """Return the verdict of linear models.
 
-    Before an alarm, the bare model is searched again from many starts: a mode that the
-    first search missed would be a false one.
-
     Args:
         search: Search that fits the models.
         equivalent: Groups of effects that no permitted action separates.
         rule: Rule of what helps and what is named.
     """
     search.fit_singles()
-    found = Verdict(search, equivalent, rule)
-    if found.detection.alarm and search.look_again():
-        found = Verdict(search, equivalent, rule)
-    return found
+    return Verdict(search, equivalent, rule)
 
 
 @dataclass
