@@ -24,7 +24,7 @@ from sbi_active.criticism.effects.augmented import AugmentedSimulator
 from sbi_active.criticism.effects.effect import Effect
 from sbi_active.criticism.effects.joint_prior import joint_prior
 from sbi_active.criticism.evidence.rival_set import RivalSet
-from sbi_active.criticism.linear.screening import linear_models
+from sbi_active.criticism.linear.screening import linear_models, thinned_to_need
 from sbi_active.criticism.misfit.contrary import judged
 from sbi_active.criticism.misfit.evaluation import evaluate_held_out, evaluate_left_out
 from sbi_active.criticism.misfit.record import traced
@@ -41,7 +41,6 @@ from sbi_active.criticism.results import (
 from sbi_active.criticism.rivals.further_trials import with_known_inputs
 from sbi_active.criticism.steps.equivalence import equivalent_effects, is_large
 from sbi_active.criticism.steps.predictive import NUM_DRAWS, find_residuals
-from sbi_active.criticism.thinning import thinned_to_need
 from sbi_active.expected import suggests
 from sbi_active.progress import stage
 from sbi_active.simulation import SimulatorModel
@@ -308,7 +307,7 @@ class Criticism:
             evaluation: The error before and after; None if not requested.
         """
         tracing = self.trace()  # which the posteriors of the models come with
-        return judged(self.rivals, tracing, evaluation)
+        return judged(self._verdict, self.rivals, tracing, evaluation)
 
     def report(
         self,

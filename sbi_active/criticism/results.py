@@ -116,7 +116,6 @@ class Evidence:
             squares, "smc" (sequential Monte Carlo), or "linear".
         names: Names of the coordinates (theta, phi).
         draws: Posterior draws of (theta, phi), shape (m, dim).
-        best_chi_square: Smallest whitened residual sum of squares among the draws.
         best: Best fit of theta and phi, (dim,), of a model that misses, whose draws are
             wide; or None.
         narrow: Draws of its posterior beside the sensor's error alone, which densities
@@ -130,7 +129,6 @@ class Evidence:
     engine: str
     names: tuple[str, ...]
     draws: Array
-    best_chi_square: float
     best: Array | None = None
     narrow: Array | None = None
 

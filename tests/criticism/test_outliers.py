@@ -7,7 +7,7 @@ from torch.distributions import Independent, Normal
 
 from sbi_active import DiscreteActions, GaussianNoise, SimulatorModel, StudentTNoise
 from sbi_active.criticism import Criticism, Effect, Trials
-from sbi_active.criticism.steps.tracing import credible_set
+from sbi_active.criticism.steps.detection import credible_set
 
 PRIOR = BoxUniform(-5 * torch.ones(2), 5 * torch.ones(2))
 ACTIONS = DiscreteActions(torch.arange(-5, 5.5, 0.5))

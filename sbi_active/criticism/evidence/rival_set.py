@@ -18,8 +18,13 @@ from sbi_active.criticism.data.measurements import Measurements
 from sbi_active.criticism.data.trials import Trials
 from sbi_active.criticism.effects.augmented import AugmentedSimulator
 from sbi_active.criticism.effects.effect import Effect
-from sbi_active.criticism.evidence.fit import NESTED, THOROUGH, Fit, settings_of
-from sbi_active.criticism.evidence.jumps import STEPS, look_for_jumps
+from sbi_active.criticism.evidence.fit import (
+    STEPS,
+    THOROUGH,
+    Fit,
+    look_for_jumps,
+    settings_of,
+)
 from sbi_active.criticism.results import SCATTER, UNEXPLAINED, Evidence, ModelKey
 from sbi_active.criticism.rivals.coordinates import SearchCoordinates
 from sbi_active.criticism.rivals.error_models import NoiseGrid
@@ -246,14 +251,14 @@ class RivalSet:
 
         Args:
             key: Key of the rival.
-            near: Points from which its modes are searched, shape (k, dim); None
-                searches from many draws of the prior.
+            near: Points from which its modes are searched beside draws of the prior,
+                shape (k, dim).
         """
         rival, seed = self.rival(key), derive_seed(self.seed, "evidence", str(key))
         repeats = NUM_REPLICATES if self.simulator.is_stochastic else 1
-        settings = settings_of(len(self.trials) * repeats, is_bare=key == ModelKey())
+        settings = settings_of(len(self.trials) * repeats)
         rng = np.random.default_rng(derive_seed(self.seed, "search", str(key)))
-        found = search(rival, rng, near, THOROUGH if near is None else NESTED)
+        found = search(rival, rng, near, THOROUGH)
         rng = np.random.default_rng(seed)
         sample = infer(rival, rng, found=found, settings=settings)
         if not len(sample.u):  # nothing has a likelihood
@@ -261,28 +266,15 @@ class RivalSet:
             equal = np.full(len(u), 1 / len(u))
             sample = replace(sample, u=u, weight=equal, log_likelihood=equal * -np.inf)
         drawn = sample.draws(NUM_DRAWS, np.random.default_rng(seed))
-        best = sample.u[np.argsort(sample.weight)[-20:]]
-        residual = rival.residual(best, penalized=False)[0]
-        square = min((rival.noise.whitener(r)(r) ** 2).sum() for r in residual)
-        evidence = self.record(rival, sample, drawn, float(square))
-        u = best[-1:] if found is None else np.r_[best[-1:], found.modes[:1]]
-        log_p = rival.log_prior(u) + rival.log_likelihood(u)
-        return Fit(rival, sample, evidence, mode=u[int(np.argmax(log_p))])
+        return Fit(rival, sample, self.record(rival, sample, drawn))
 
-    def record(
-        self,
-        rival: Rival,
-        sample: WeightedDraws,
-        u: Array,
-        chi_square: float,
-    ) -> Evidence:
+    def record(self, rival: Rival, sample: WeightedDraws, u: Array) -> Evidence:
         """Return the record of a rival.
 
         Args:
             rival: The rival.
             sample: Sample of its posterior.
             u: Draws that are shown, shape (n, dim).
-            chi_square: Smallest whitened residual sum of squares.
         """
         c, own = rival.coordinates, rival.coordinates.num_own
         return Evidence(
@@ -293,7 +285,6 @@ class RivalSet:
             engine=sample.method,
             names=self.names_of(rival),
             draws=c.to_z(u)[:, :own],
-            best_chi_square=chi_square,
         )
 
     def names_of(self, rival: Rival) -> tuple[str, ...]:

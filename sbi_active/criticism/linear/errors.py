@@ -39,11 +39,10 @@ from sbi_active.criticism.linear.processes import (
 )
 from sbi_active.criticism.results import OUTLIER, UNEXPLAINED
 from sbi_active.criticism.rivals.error_models import LOG_2PI, NoiseGrid
+from sbi_active.criticism.rivals.noise_grid import LARGEST, sizes
 from sbi_active.criticism.steps.predictive import is_first_part
 from sbi_active.inference.sampling.weights import log_sum_exp
 
-#: Sizes of the process in sensor deviations, a factor apart.
-SMALLEST, LARGEST, FACTOR = 0.3, 40.0, 1.63
 #: Every so many of the sizes is one of what differs from trial to trial, and every so
 #: many of sizes and time scales one of a gross error.
 THINNED = 2
@@ -96,13 +95,11 @@ class Errors:
         self.is_scored = np.ones(len(m), dtype=bool)
         if self.is_by_trial:
             self.is_scored = ~is_first_part(m, warm_up)
-        top = max(LARGEST, 2 * largest)
-        num = 1 + round(np.log(top / SMALLEST) / np.log(FACTOR))
-        self.sizes = np.geomspace(SMALLEST, top, num)
+        self.sizes = sizes(max(LARGEST, 2 * largest))
         # Numbers that do not follow each other have errors of their own.
         self.kernels = (False, True) if m.is_sequence else (False,)
         self.times = time_scales(m, self.fold)[: None if m.is_sequence else 1]
-        variances = np.stack([np.ones(num), self.sizes**2], 1)
+        variances = np.stack([np.ones(len(self.sizes)), self.sizes**2], 1)
         self.processes = Processes.grid(variances, self.times, self.kernels)
         self.filters = Filters(self.processes, m, self.fold, self.fold)
         self.cells = [replace(c, sd=c.sd / unit) for c in noise.cells]

@@ -24,12 +24,10 @@ class FitSettings:
     """Settings of what is spent on fits.
 
     Attributes:
-        num_starts: Draws of the prior at which the bare model's search begins.
+        num_starts: Draws of the prior at which the bare model's search begins: a mode
+            that it missed would be a false alarm.
         num_kept: Searches that go on from there.
         first: Steps of these searches along secants.
-        starts_again: Draws of the prior at which the bare model's search begins before
-            an alarm: a mode that the first search missed would be a false one.
-        kept_again: Searches that go on from there.
         num_drawn: Draws of a further effect at which its fit begins, beside its null.
         num_far: Draws of the prior that are screened for a set with an effect that no
             number makes vanish: parameters beside it lie far from those without it.
@@ -50,11 +48,9 @@ class FitSettings:
             is looked for.
     """
 
-    num_starts: int = 6
-    num_kept: int = 2
+    num_starts: int = 24
+    num_kept: int = 4
     first: int = 8
-    starts_again: int = 24
-    kept_again: int = 4
     num_drawn: int = 3
     num_far: int = 32
     num_kept_far: int = 6
@@ -72,8 +68,8 @@ class FitSettings:
 
 
 #: Where the simulator jumps a search ends at any of many places near the best one: with
-#: half of the starts one of six sets of the box collision had a wrong name.
-JUMPING = FitSettings(num_starts=12, num_kept=4, num_drawn=12)
+#: half of the draws one of six sets of the box collision had a wrong name.
+JUMPING = FitSettings(num_drawn=12)
 
 
 def best_fit(rival: Rival, u: Array, unit: Array, settings: FitSettings) -> LinearModel:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +13,7 @@ from sbi_active.criticism.linear.errors import Errors
 from sbi_active.criticism.linear.mixture import Mixture, either
 from sbi_active.criticism.linear.model import LinearModel
 from sbi_active.criticism.results import ModelKey
-from sbi_active.criticism.steps.tracing import log_prior
+from sbi_active.criticism.steps.detection import log_prior
 
 
 class Library:
@@ -53,13 +54,23 @@ class Library:
         self._prepared = self._at(names)
         self._grams = self.errors.grams(self._every.part(self._prepared).rows)
 
-    def look_at_each(self) -> None:
-        """Compute the posterior of each effect alone, a dozen at a time."""
-        for start in range(0, len(self.names), 12):
-            some = self.names[start : start + 12]
+    def scores(
+        self, names: Sequence[str], num: int, *, most: int = 12
+    ) -> dict[tuple[str, ...], float]:
+        """Return the log posterior probabilities of all sets of some effects.
+
+        Args:
+            names: Effects, in the library's order.
+            num: Number of effects of a set.
+            most: Number of effects alone whose Gram matrices are in memory at once.
+        """
+        size = most if num == 1 else max(len(names), 1)
+        found = {}
+        for start in range(0, len(names), size):
+            some = names[start : start + size]
             self.prepare(some)
-            for name in some:
-                self._posterior((name,))
+            found |= {new: self.score(new) for new in combinations(some, num)}
+        return found
 
     def score(self, names: tuple[str, ...]) -> float:
         """Return the log posterior probability of a set, unnormalized."""

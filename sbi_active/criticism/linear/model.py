@@ -207,32 +207,6 @@ def _in_own_deviations(rival: Rival, model: LinearModel, unit: Array) -> LinearM
     )
 
 
-def reweighted_at(model: LinearModel, u: Array, df: float) -> LinearModel:
-    """Return a linear model of t errors with its weights at another point.
-
-    Args:
-        model: Linear model of t errors.
-        u: Point, shape (d,).
-        df: Degrees of freedom of the errors.
-    """
-    weight = np.sqrt((df + 1 - model.residual**2) / (df - 2))  # of the residual itself
-    jacobian = model.jacobian / weight[:, None]
-    plain = replace(
-        model,
-        u=u,
-        residual=model.residual / weight + jacobian @ (u - model.u),
-        jacobian=jacobian,
-        scale=model.scale * weight,
-        offset=model.offset - _less(model.residual / weight, weight, df),
-    )
-    return _reweighted(plain, df)
-
-
-def _less(r: Array, weight: Array, df: float) -> Array:
-    """Return log densities of t errors less those of weighted Gaussian ones, (N,)."""
-    return student(r, df) + 0.5 * LOG_2PI + 0.5 * (weight * r) ** 2
-
-
 def _reweighted(model: LinearModel, df: float) -> LinearModel:
     r"""Return a linear model of t errors: a Gaussian, wider by what each residual says.
 
@@ -254,7 +228,7 @@ def _reweighted(model: LinearModel, df: float) -> LinearModel:
         residual=weight * r,
         jacobian=weight[:, None] * model.jacobian,
         scale=model.scale / weight,
-        offset=model.offset + _less(r, weight, df),
+        offset=model.offset + student(r, df) + 0.5 * (LOG_2PI + (weight * r) ** 2),
     )
 
 

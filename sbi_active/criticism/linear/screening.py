@@ -1,4 +1,6 @@
-"""Screening of a large library of effects by the linear evidence of one Jacobian.
+"""What precedes the fits: samples and effects that are left out of them.
+
+A library of many effects is screened by the linear evidence of one Jacobian.
 
 A fit of an effect takes a dozen simulations of the trials, its column one. With the
 bare model's best fit and a column of every effect the evidence of all singles and pairs
@@ -9,18 +11,20 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import combinations
 
 import numpy as np
 
 from sbi_active.arrays import Array
 from sbi_active.criticism.data.measurements import Measurements
+from sbi_active.criticism.data.sampling import Sampling, suggested_sampling, thinned
+from sbi_active.criticism.data.trials import Trials
 from sbi_active.criticism.evidence.rival_set import RivalSet
 from sbi_active.criticism.linear.fits import JUMPING, FitSettings, best_fit, sensor_of
 from sbi_active.criticism.linear.library import Library
 from sbi_active.criticism.linear.model import LinearModel
 from sbi_active.criticism.linear.search import Search
 from sbi_active.criticism.results import ModelKey
+from sbi_active.criticism.rivals.noise_grid import measurement_sds
 from sbi_active.criticism.steps.equivalence import MANY
 
 #: Effects whose pairs are compared, best alone, and effects that are fitted: with 24,
@@ -74,7 +78,6 @@ def linear_models(rivals: RivalSet) -> tuple[Search, Screening | None]:
     behind = {n: best[ranked[0]] - best[n] for n in ranked[FITTED:]}
     # Effects on the noise change no prediction, and no column tells of them.
     kept = tuple(n for n in rivals.effects if n not in behind)
-    search.restrict(kept)
     search.rivals = rivals.with_effects(kept)
     return search, Screening(kept, behind) if behind else None
 
@@ -97,13 +100,42 @@ def _scores(library: Library) -> dict[str, float]:
 
     It is that of the effect alone, or in a pair that is better than either member.
     """
-    library.look_at_each()
-    singles = {n: library.score((n,)) for n in library.names}
+    singles = {n: value for (n,), value in library.scores(library.names, 1).items()}
     ranked = sorted(singles, key=singles.__getitem__)[::-1]
     paired, best = [n for n in library.names if n in ranked[:PAIRED]], dict(singles)
-    library.prepare(paired)
-    for pair in combinations(paired, 2):
-        value = library.score(pair)
+    for pair, value in library.scores(paired, 2).items():
         if value > max(singles[name] for name in pair):
             best |= {name: max(best[name], value) for name in pair}
     return best
+
+
+def thinned_to_need(rivals: RivalSet, trials: Trials) -> tuple[Trials, Sampling | None]:
+    """Return trials without samples that the bare model's fit shows to be redundant.
+
+    Trials are thinned only if ``measurement_sd`` declares the sensor's error: errors
+    beyond it are the simulator's, and smooth.
+
+    Args:
+        rivals: The models of the trials that may be fitted.
+        trials: All trials.
+
+    Returns:
+        The trials, as they are where nothing is to be left out; and what was found of
+        their sampling, None if it was not looked at.
+    """
+    fit = rivals.trials
+    own = fit.sample_times is not None
+    times = fit.sample_times if own else rivals.model.sample_times
+    if (
+        times is None
+        or measurement_sds(rivals.model.noise, rivals.measurements) is None
+    ):
+        return trials, None
+    sensor = sensor_of(rivals)
+    bare = Search(rivals, sensor).model(ModelKey())
+    left = np.full(fit.x.numel(), np.nan)
+    left[rivals.measurements.position] = sensor.unit * bare.residual
+    sampling = suggested_sampling(fit, left.reshape(fit.x.shape), times)
+    if sampling.every == 1:
+        return trials, sampling
+    return thinned(trials, sampling, trials.sample_times if own else times), sampling

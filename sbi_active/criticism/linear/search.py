@@ -10,8 +10,7 @@ beside one of the best single effects, and larger sets grown from the best small
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field, replace
-from itertools import combinations
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,7 +39,7 @@ from sbi_active.criticism.linear.model import (
 from sbi_active.criticism.results import ModelKey
 from sbi_active.criticism.rivals.residual_process import ResidualProcess
 from sbi_active.criticism.rivals.rival import Rival
-from sbi_active.criticism.steps.tracing import log_prior, log_priors
+from sbi_active.criticism.steps.detection import log_prior, log_priors
 from sbi_active.seeding import derive_seed
 
 
@@ -57,7 +56,6 @@ class Search:
         found: Fitted models, the bare one first.
         errors: Errors that all models share; known after the bare fit.
         prior: Log prior probabilities of "none" and each effect of the library.
-        names: Effects that change the prediction, of which sets are fitted.
         units: Deviations of residuals in a search, (N,); (2 N,) if it is random.
     """
 
@@ -67,9 +65,7 @@ class Search:
     found: dict[ModelKey, Candidate] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        effects = self.rivals.effects.values()
         self.prior = log_priors(self.rivals.library)
-        self.names = [e.name for e in effects if e.hook != "noise"]
         self._rivals: dict[ModelKey, Rival] = {}
         self._reference: Array | None = None
         self.units = self.sensor.unit
@@ -78,14 +74,10 @@ class Search:
             self.units = np.ones(2 * len(self.units))
         self._library: Library | None = None
         self._processes: dict[bytes, ResidualProcess] = {}
-        self._looked_again = False
+        self._has_larger = False
         self._seed = derive_seed(self.rivals.seed, "misfit")
-        self._begin(self._fit_bare())
-
-    def _begin(self, bare: LinearModel) -> None:
-        """Keep a fit of the bare model, from which all others begin."""
-        self.found.clear()
-        self._library, self._has_larger = None, False
+        own = self.rival(ModelKey()), self.rivals.prior_draws, self.units
+        bare = best_fit(*own, self.settings)
         self.errors = Errors(
             self.rivals.measurements,
             self.sensor.unit,
@@ -96,24 +88,10 @@ class Search:
         )
         self.keep(bare)
 
-    def look_again(self) -> bool:
-        """Search the bare model from many more starts; return whether it fits better.
-
-        A mode that the first search missed would be a false alarm. All models are then
-        fitted again from it. It is done once.
-        """
-        if self._looked_again:
-            return False
-        self._looked_again = True
-        settings, given = self.settings, (self.rivals.prior_draws, self.units)
-        most = {"num_starts": settings.starts_again, "num_kept": settings.kept_again}
-        best = best_fit(self.rival(ModelKey()), *given, replace(settings, **most))
-        fall = self.found[ModelKey()].model.cost - best.cost
-        if fall < settings.worth * max(best.rms, 1.0) ** 2:
-            return False
-        self._begin(best)
-        self.fit_singles()
-        return True
+    @property
+    def names(self) -> list[str]:
+        """Effects that change the prediction, of which sets are fitted."""
+        return [e.name for e in self.rivals.effects.values() if e.hook != "noise"]
 
     @property
     def unit(self) -> Array:
@@ -142,12 +120,6 @@ class Search:
         left = leave_out(model, self.errors)
         self.found[model.key] = Candidate(model, grams, sensor, beside, left, prior)
         return self.found[model.key]
-
-    def restrict(self, names: Iterable[str]) -> None:
-        """Fit sets of some effects alone from now on, in the library's order."""
-        some = {*names}
-        every = self.rivals.library
-        self.names = [e.name for e in every if e.name in some and e.hook != "noise"]
 
     def fit_singles(self) -> None:
         """Fit each effect alone, and the bare model from where they end, once."""
@@ -276,13 +248,9 @@ class Search:
             return {}
         names = [n for n in self.names if n not in base.effects and not self._free(n)]
         library = self._library_of(base, names) if base.effects else self.library
-        library.prepare(names)
-        found = {}
-        for new in combinations(names, size - len(base.effects)):
-            key = self._joined(base, new)
-            if key not in self.found:
-                found[key] = library.score(new)
-        return found
+        scores = library.scores(names, size - len(base.effects))
+        found = {self._joined(base, new): value for new, value in scores.items()}
+        return {key: value for key, value in found.items() if key not in self.found}
 
     def _library_of(self, base: ModelKey, names: Sequence[str]) -> Library:
         """Return a model with columns of effects that it lacks."""
@@ -308,10 +276,6 @@ class Search:
             given = {"reference": self._reference, "df": self.sensor.df}
             self._rivals[key] = self.rivals.rival(key, **given)
         return self._rivals[key]
-
-    def _fit_bare(self) -> LinearModel:
-        own = self.rival(ModelKey()), self.rivals.prior_draws, self.units
-        return best_fit(*own, self.settings)
 
     def _fit(self, key: ModelKey, parents: Sequence[ModelKey]) -> LinearModel:
         """Fit a set of effects from the smaller one that leaves least."""

@@ -26,7 +26,7 @@ from sbi_active.criticism.linear.left_out import Candidate
 from sbi_active.criticism.linear.mixture import WIDTHS, Mixture, summed
 from sbi_active.criticism.linear.search import Search
 from sbi_active.criticism.results import OUTLIER, SCATTER, UNEXPLAINED, ModelKey
-from sbi_active.criticism.rivals.validity import (
+from sbi_active.criticism.rivals.rival import (
     DISAGREEMENT,
     UNKNOWN_RATES,
     log_outcomes,
@@ -276,14 +276,26 @@ class States:
         Args:
             key: Effects of the model.
         """
-        cells, model = self.search.errors.cells, self.search.model(self.predicting(key))
-        residual, (square, freedom, p) = model.residual[None], model.chi_square
-        residual = residual[:, : model.num]
+        model = self.search.model(self.predicting(key))
+        _, freedom, p = model.chi_square
+        square = self.square(model.residual[: model.num])
         if is_louder := bool(self.louder(key)):
-            residual = residual / self.louder_draws(key)[1]
-        if is_correlated := len(cells) == 1 and bool(cells[0].rho.any()):
-            residual = cells[0].whiten(residual)
-        if is_louder or is_correlated:
-            square = float((residual**2).sum(1).min())
+            residual = model.residual[: model.num] / self.louder_draws(key)[1]
+            square = float((self._innovations(residual) ** 2).sum(1).min())
+        if is_louder or self._is_correlated:
             p = float(chi2.sf(square, freedom))
         return square, p
+
+    def square(self, residual: Array) -> float:
+        """Return the sum of the squares of residuals (N,) in sensor deviations."""
+        return float((self._innovations(residual) ** 2).sum())
+
+    @property
+    def _is_correlated(self) -> bool:
+        cells = self.search.errors.cells
+        return len(cells) == 1 and bool(cells[0].rho.any())
+
+    def _innovations(self, residual: Array) -> Array:
+        """Return residuals (..., N) without a correlation that is declared."""
+        cell = self.search.errors.cells[0]
+        return cell.whiten(residual) if self._is_correlated else residual

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -14,6 +14,7 @@ from sbi_active.criticism.contradictions import BoundParameter, Bounds
 from sbi_active.criticism.evidence.fit import Fit
 from sbi_active.criticism.evidence.rival_set import RivalSet
 from sbi_active.criticism.forces.library import is_force
+from sbi_active.criticism.misfit.verdict import Verdict
 from sbi_active.criticism.results import (
     CATCH_ALLS,
     NONE,
@@ -28,7 +29,6 @@ from sbi_active.criticism.rivals.rival import Rival
 from sbi_active.criticism.steps.detection import LEVEL, THRESHOLD
 from sbi_active.criticism.under_misfit import Misfit
 from sbi_active.inference.sampling.least_squares import descend
-from sbi_active.seeding import derive_seed
 
 #: Score of trials that speaks against effects.
 DENSITY = "log predictive density"
@@ -141,12 +141,11 @@ def withdrawn(tracing: Tracing) -> Tracing:
     )
 
 
-#: Draws of a posterior that say whether it lies at a bound, and steps of a refit.
-NUM_DRAWS, STEPS = 400, 30
-
-
 def judged(
-    rivals: RivalSet, tracing: Tracing, evaluation: Evaluation | None
+    found: Verdict,
+    rivals: RivalSet,
+    tracing: Tracing,
+    evaluation: Evaluation | None,
 ) -> Tracing:
     """Return the tracing, and whether its forces are stand-ins.
 
@@ -156,11 +155,12 @@ def judged(
     prior makes up for.
 
     Args:
-        rivals: The models.
+        found: The verdict, with its linear models.
+        rivals: The models with their posteriors.
         tracing: Tracing with the effects that the data point to.
         evaluation: Error before and after on trials that had no part in it.
     """
-    tracing = beyond_bounds(rivals, unless_refuted(tracing, evaluation))
+    tracing = beyond_bounds(found, rivals, unless_refuted(tracing, evaluation))
     effects = {e.name: e for e in rivals.library}
     if not any(is_force(effects[name]) for name in tracing.chosen):
         return tracing
@@ -187,7 +187,7 @@ def _reasons(
         yield f"a residual process beside it gains {tracing.log_process:.1f} nats"
 
 
-def beyond_bounds(rivals: RivalSet, tracing: Tracing) -> Tracing:
+def beyond_bounds(found: Verdict, rivals: RivalSet, tracing: Tracing) -> Tracing:
     """Return the tracing with the parameters at bounds, and fits with a wider prior.
 
     Parameters of the bare model and of the verdict's model that lie at a bound are
@@ -198,35 +198,41 @@ def beyond_bounds(rivals: RivalSet, tracing: Tracing) -> Tracing:
     prior is.
 
     Args:
-        rivals: The models.
+        found: The verdict, with its linear models.
+        rivals: The models with their posteriors.
         tracing: Tracing with the effects that the data point to.
     """
-    keys = [k for k in dict.fromkeys([ModelKey(), tracing.key]) if k in rivals.fits]
-    fits = [rivals.fits[key] for key in keys]
-    sides = [_sides(fit, derive_seed(rivals.seed, "bounds")) for fit in fits]
-    if not any(side.any() for side in sides):
+    keys, own = {ModelKey(): ModelKey()}, found.states.predicting(tracing.key)
+    if tracing.key in rivals.fits:
+        keys.setdefault(own, tracing.key)
+    fits = {key: found.model(key).u for key in keys}
+    sides = {key: _sides(rivals.fits[known]) for key, known in keys.items()}
+    if not any(side.any() for side in sides.values()):
         return _unless_none(tracing, Bounds())
-    start, own = fits[-1].point, rivals.rival(ModelKey(keys[-1].effects))
-    whiten = rivals.noise.whitener(own.residual(start[None])[0][0])
-    u = _best(rivals, own, whiten, start[None])
-    assert u is not None
-    square = float((whiten(own.residual(u[None])[0][0]) ** 2).sum())
-    dim, bounds = rivals.prior.event_shape[0], Bounds()
-    for key, fit, side in zip(keys, fits, sides, strict=True):
+    (last, u), rival = [*fits.items()][-1], rivals.rival(own)
+    whiten = rivals.noise.whitener(rival.residual(u[None])[0][0])  # errors may last
+    best = _refitted(rivals, rivals.rival(last), whiten, [u])
+    assert best is not None
+    square, bounds, dim = best[1], Bounds(), rival.theta_dim
+    spare = max(rival.num_observed - rival.dim, 1)
+    for key, side in sides.items():
         if not side.any():
             continue
-        rival = _moved(rivals.rival(key), side)
-        starts = np.stack([fit.point, np.r_[start[:dim], fit.point[dim:]]])
-        u = _best(rivals, rival, whiten, starts)
-        held = _held(rivals, fit, side, rival, u)
+        rival, point = _moved(rivals.rival(key), side), fits[key]
+        starts = [point, np.r_[u[:dim], point[dim:]]]
+        again = _refitted(rivals, rival, whiten, starts)
+        held = _held(rivals, side, rival, again)
         bounds = replace(bounds, parameters=(*bounds.parameters, *held))
-        if key != ModelKey() or u is None or not held:
+        if key != ModelKey() or again is None or not held:
             continue
-        rest = rival.residual(u[None])[0][0]
-        spare = max(len(rest) - rival.dim, 1)
-        more = float((whiten(rest) ** 2).sum()) - square
-        bounds = replace(bounds, p_value=_tail(rivals, tracing, rest, whiten, spare))
-        if tracing.chosen and more < 2 * THRESHOLD * max(square / spare, 1.0):
+        if found.search.sensor.is_known:
+            rest = rival.residual(again[0][None])[0][0] / found.search.unit
+            freedom = max(len(rest) - rival.dim, 1)
+            p_value = float(chi2.sf(found.states.square(rest), freedom))
+            bounds = replace(bounds, p_value=p_value)
+        if tracing.chosen and again[1] - square < 2 * THRESHOLD * max(
+            square / spare, 1.0
+        ):
             bounds = replace(bounds, replaces=str(ModelKey(tracing.chosen)))
     return _unless_none(tracing, bounds)
 
@@ -241,14 +247,12 @@ def _unless_none(tracing: Tracing, bounds: Bounds) -> Tracing:
     return replace(tracing, bounds=bounds)
 
 
-def _sides(fit: Fit, seed: int) -> NDArray[np.int64]:
+def _sides(fit: Fit) -> NDArray[np.int64]:
     """Return at which bound each of theta and phi is in a model, (d,): -1, 1 or 0."""
     c = fit.rival.coordinates
     own = c.num_own
-    if fit.best is None:
-        u = fit.sample.draws(NUM_DRAWS, np.random.default_rng(seed))
-    else:  # where draws are as wide as misfit asks, some reach any bound
-        u = fit.best[None]
+    # Where draws are as wide as misfit asks, some reach any bound.
+    u = fit.sample.u if fit.best is None else fit.best[None]
     side = c.sides(u[:, :own])
     # An effect that vanishes at a bound is a weak one, and no prior is too narrow.
     z, null = c.to_z(c.center[None])[0], np.zeros(own, dtype=bool)
@@ -257,7 +261,7 @@ def _sides(fit: Fit, seed: int) -> NDArray[np.int64]:
         z[place], null[place] = effect.null_phi(1).double().numpy()[0], True
     ends = np.where(side < 0, c.low[:own], c.high[:own])
     side[null & (np.abs(c.from_z(z[None])[0, :own] - ends) < 1e-6)] = 0
-    return side
+    return side[fit.rival.searched[:own]]
 
 
 def _moved(rival: Rival, side: NDArray[np.int64]) -> Rival:
@@ -280,57 +284,51 @@ def _moved(rival: Rival, side: NDArray[np.int64]) -> Rival:
     return rival
 
 
-def _best(
-    rivals: RivalSet, rival: Rival, whiten: Whitener, starts: Array
-) -> Array | None:
-    """Return the best fit of a rival, (d,); None if the simulator has none."""
+def _refitted(
+    rivals: RivalSet, rival: Rival, whiten: Whitener, starts: Sequence[Array]
+) -> tuple[Array, float] | None:
+    """Return the best fit of a rival and its squares; None if the simulator has none.
+
+    Without a derivative nothing is fitted again.
+    """
     if not rivals.is_smooth:
-        return starts[0]
+        return starts[0], np.inf
+    given = np.stack(starts), whiten, rivals.step
     try:
-        u, cost = descend(rival, starts, whiten, rivals.step, STEPS)
+        u, cost = descend(rival, *given, 30)
     except (ArithmeticError, RuntimeError, ValueError):
         return None  # a simulator may refuse what its prior excludes
-    return u[int(np.argmin(cost))]
-
-
-def _tail(
-    rivals: RivalSet, tracing: Tracing, rest: Array, whiten: Whitener, spare: int
-) -> float:
-    """Return the tail probability of a chi-square; NaN where errors have no size."""
-    misfit, noise = tracing.misfit, rivals.model.noise
-    if misfit is not None:
-        unit = misfit.sensor[rivals.measurements.channel]
-        return float(chi2.sf(((rest / unit) ** 2).sum(), spare))
-    if noise is None or noise.posterior is not None or len(rivals.noise.scales) > 1:
-        return float("nan")
-    return float(chi2.sf((whiten(rest) ** 2).sum(), spare))
+    u = u[np.argmin(cost)]
+    return u, float((whiten(rival.residual(u[None])[0][0]) ** 2).sum())
 
 
 def _held(
-    rivals: RivalSet, fit: Fit, side: NDArray[np.int64], rival: Rival, u: Array | None
+    rivals: RivalSet,
+    side: NDArray[np.int64],
+    rival: Rival,
+    again: tuple[Array, float] | None,
 ) -> list[BoundParameter]:
     """Return the parameters of a model at bounds, and where they are beyond them.
 
     One that stays inside though its bound was moved is not held by it.
     """
-    c = fit.rival.coordinates
-    z = np.full(c.dim, np.nan) if u is None else rival.coordinates.to_z(u[None])[0]
-    names = rivals.names_of(rival)
-    found = []
+    before, c = rivals.rival(rival.key).coordinates, rival.coordinates
+    z = np.full(c.dim, np.nan)
+    if again is not None and rivals.is_smooth:
+        z = c.to_z(again[0][None])[0]
+    names, found = rivals.names_of(rival), []
     for k in np.flatnonzero(side).tolist():
-        ends = np.where(side[k] < 0, c.low, c.high)
+        ends = before.low if side[k] < 0 else before.high
         bound = c.to_z(np.where(np.isfinite(ends), ends, 0.0)[None])[0, k]
-        # Without a derivative nothing was fitted again.
-        beyond = z[k] if rivals.is_smooth else np.nan
-        if side[k] * (beyond - bound) <= 0:
+        if side[k] * (z[k] - bound) <= 0:
             continue
         found.append(
             BoundParameter(
                 name=names[k],
-                model=str(ModelKey(rival.key.effects)),
+                model=str(rival.key),
                 side="lower" if side[k] < 0 else "upper",
                 bound=float(bound),
-                beyond=float(beyond),
+                beyond=float(z[k]),
             )
         )
     return found

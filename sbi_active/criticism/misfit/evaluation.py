@@ -7,22 +7,22 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from scipy.stats import chi2
 
 from sbi_active.arrays import Array
 from sbi_active.criticism.data.trials import Trials
 from sbi_active.criticism.evidence.rival_set import RivalSet
-from sbi_active.criticism.misfit.draws import fitted
+from sbi_active.criticism.linear.fits import sensor_of
+from sbi_active.criticism.misfit.draws import posterior
 from sbi_active.criticism.misfit.verdict import Verdict
 from sbi_active.criticism.results import (
     NONE,
-    OUTLIER,
+    SCATTER,
     UNEXPLAINED,
     Evaluation,
     ModelKey,
     Tracing,
 )
-from sbi_active.criticism.steps.missed_trials import LEVEL, missed_trials
+from sbi_active.criticism.steps.missed_trials import LEVEL, missed_trials, tails_of
 from sbi_active.criticism.steps.predictive import NUM_DRAWS, Prediction, predict
 from sbi_active.progress import stage
 from sbi_active.simulation import GaussianNoise
@@ -55,10 +55,16 @@ def evaluate_held_out(
     num = len(held_out)
     scored, selected = (scores(before), scores(after)), (tracing.verdict,) * num
     found = summary("held out", np.arange(num), *scored, selected, held_out.names)
-    missed = missed_trials(rivals, tracing, held_out, before, after, level=level)
+    sensor = None
+    if rivals.model.noise is not None:
+        square = rivals.measurements.by_channel(sensor_of(rivals).unit ** 2)
+        sensor = np.sqrt(square)
+    own = tracing, held_out, before, after
+    missed = missed_trials(*own, sensor=sensor, level=level)
     has_size = len(rivals.noise.scales) == 1
     if has_size and isinstance(rivals.model.noise, GaussianNoise):
-        found = replace(found, p_value=tail(after))
+        every = np.zeros(len(after.measurements), dtype=np.int64)
+        found = replace(found, p_value=float(tails_of(after, every)[0]))
     return replace(found, missed=missed)
 
 
@@ -93,12 +99,10 @@ def evaluate_left_out(
         for place, own in zip(places, found.search.errors.trials, strict=True):
             one = trials.select([int(place)])
             key = found.chosen_by(~own)
-            model = ModelKey(key.effects)
-            if not key.effects and key.error not in (UNEXPLAINED, OUTLIER):
-                model = key
+            model = _predicting(found, key)
             scored = {}
             for each in dict.fromkeys((ModelKey(), model)):
-                fit = fitted(found, models, each, ~own)
+                fit = posterior(found, models, each, ~own)
                 prediction = predict(models, one, fit=fit, num_draws=num_draws)
                 scored[each] = scores(prediction)
             before.append(scored[ModelKey()])
@@ -115,19 +119,16 @@ def evaluate_left_out(
     return summary("leave one out", places, first, last, (*selected,), names)
 
 
-def tail(prediction: Prediction) -> float:
-    r"""Return the tail probability of :math:`e^T (S + R)^{-1} e`.
+def _predicting(found: Verdict, key: ModelKey) -> ModelKey:
+    """Return the model that predicts where a verdict without a trial is some key.
 
-    S is the covariance of the predictions over the posterior, and R that of the noise,
-    whose errors are taken as independent.
-
-    Args:
-        prediction: Prediction of some trials that were measured.
+    Where all trials scatter, errors are larger than declared in each fold: without one
+    of few trials the others may not show it.
     """
-    off = prediction.mean - prediction.mean.mean(0)
-    cov = off.T @ off / (len(off) - 1) + np.diag((prediction.sd**2).mean(0))
-    error = prediction.measurements.x - prediction.middle
-    return float(chi2.sf(error @ np.linalg.solve(cov, error), len(error)))
+    scatters = SCATTER in (key.error, found.key.error)
+    if not scatters or found.is_missed or found.states.louder(key):
+        return ModelKey(key.effects)
+    return ModelKey(key.effects, SCATTER)
 
 
 def scores(prediction: Prediction) -> dict[str, Array]:

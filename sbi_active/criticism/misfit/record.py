@@ -15,7 +15,7 @@ from sbi_active.criticism.data.trials import Trials
 from sbi_active.criticism.evidence.rival_set import RivalSet
 from sbi_active.criticism.linear.search import Search
 from sbi_active.criticism.misfit.contrary import is_left_to_chance, withdrawn
-from sbi_active.criticism.misfit.draws import posterior
+from sbi_active.criticism.misfit.draws import posterior, shown
 from sbi_active.criticism.misfit.guesses import guess_residual
 from sbi_active.criticism.misfit.scored import weights_by_error
 from sbi_active.criticism.misfit.verdict import Verdict
@@ -27,14 +27,13 @@ from sbi_active.criticism.results import (
     Tracing,
 )
 from sbi_active.criticism.rivals.trial_simulator import TrialSimulator
-from sbi_active.criticism.steps.detection import THRESHOLD
+from sbi_active.criticism.steps.detection import THRESHOLD, credible_set
 from sbi_active.criticism.steps.equivalence import (
     equivalent_effects,
     every_action,
     noise_unit,
 )
 from sbi_active.criticism.steps.predictive import predict
-from sbi_active.criticism.steps.tracing import credible_set
 from sbi_active.criticism.under_misfit import Misfit as Found
 from sbi_active.criticism.under_misfit import ModelError
 from sbi_active.seeding import derive_seed
@@ -60,21 +59,29 @@ def traced(
         near: Whether to look for groups that these trials do not separate as well.
     """
     rivals, is_missed = found.rivals, found.is_missed
-    keys, probabilities = _tabled(found) if is_missed else _likely(found)
-    models = _with_posteriors(found, keys)
+    probabilities = _tabled(found) if is_missed else found.probabilities
+    models = _with_posteriors(found)
     evidences = {str(key): fit.evidence for key, fit in models.fits.items()}
     groups = equivalent_effects(rivals, None) if near and not is_missed else ()
+    by_name = {str(key): p for key, p in probabilities.items()}
+    helps, named = found.helps, found.named
+    error = found.key.error or (UNEXPLAINED if is_missed else None)
     trials = rivals.trials
     tracing = Tracing(
-        probabilities=probabilities,
+        verdict=str(ModelKey(named) if named else ModelKey(error=error)),
+        chosen=helps if is_missed else named,
+        probabilities=by_name,
         inclusion=found.inclusion,
-        credible_set=credible_set(probabilities),
+        credible_set=credible_set(by_name),
         equivalent=(*found.equivalent,),
         near=groups,
         estimates=_estimates(found, evidences),
         evidences=evidences,
         robust=found.is_robust(),
+        guesses=_guesses(found),
+        beside=tuple(n for n in helps if n not in named),
         trial_names=dict(zip(trials.index.tolist(), trials.names, strict=True)),
+        p_value=found.p_value,
         **(_missing(found, models, held_out) if is_missed else _explaining(found)),
     )
     if found.detection.alarm:
@@ -84,70 +91,56 @@ def traced(
     return withdrawn(tracing) if is_withdrawn else tracing, models
 
 
-def _likely(found: Verdict) -> tuple[list[ModelKey], dict[str, float]]:
-    """Return the models that are recorded if one explains, and probabilities."""
-    p, states = found.probabilities, found.states
-    louder = [key for key in p if states.louder(key) and p[key] >= SHOWN]
-    keys = [*states.keys(ModelKey()), *_shown(found), found.key, *louder]
-    keys += [ModelKey((name,)) for name in found.rivals.effects]
-    keys = [key for key in keys if key.error is None or not key.effects]
-    return keys, {str(key): value for key, value in p.items()}
-
-
 def _explaining(found: Verdict) -> dict[str, Any]:
     """Return the part of a tracing that is of models one of which explains."""
-    states, key, best = found.states, found.key, found.choice.key
-    is_unexplained = key.error == UNEXPLAINED  # with an error of no declared size
-    chosen, effects = () if is_unexplained else key.effects, ModelKey(key.effects)
-    has_size = found.search.sensor.is_known
+    states, best = found.states, found.choice.key
     gain = states.log_evidence(ModelKey(best.effects, UNEXPLAINED))
+    needed = states.needed(ModelKey(found.named), THRESHOLD) if found.named else ()
     return {
-        "verdict": str(ModelKey(chosen) if chosen else ModelKey(error=key.error)),
-        "chosen": chosen,
-        "guesses": _guesses(found) if is_unexplained else (),
-        "beside": key.effects if is_unexplained else (),
         "outliers": found.outliers,
-        "needed": states.needed(effects, THRESHOLD) if chosen else (),
-        "p_value": states.chi_square(effects)[1] if has_size else float("nan"),
+        "needed": needed,
         "log_process": gain - states.log_evidence(best),
     }
 
 
-def _tabled(found: Verdict) -> tuple[list[ModelKey], dict[str, float]]:
-    """Return the models that are recorded if every one misses, and probabilities."""
-    tabled = [*_shown(found), found.choice.key, ModelKey()]
-    singles = [ModelKey((name,)) for name in found.search.names]
-    p = {key: found.choice.probabilities.get(key, 0.0) for key in [*tabled, *singles]}
-    ordered = sorted(p.items(), key=lambda item: -item[1])
-    return [*tabled, *singles, *_weights(found)], {str(key): v for key, v in ordered}
+def _tabled(found: Verdict) -> dict[ModelKey, float]:
+    """Return the probabilities of what is listed if every model misses."""
+    p, singles = found.choice.probabilities, map(ModelKey, zip(found.search.names))
+    keys = [*_shown(found), found.choice.key, ModelKey(), *singles]
+    return dict(sorted(((k, p.get(k, 0.0)) for k in keys), key=lambda item: -item[1]))
 
 
 def _missing(
     found: Verdict, models: RivalSet, held_out: Trials | None
 ) -> dict[str, Any]:
     """Return the part of a tracing that is of models that all miss the trials."""
-    choice, timed = found.choice, found.rivals.measurements.is_sequence
-    named, helps = choice.named, choice.key.effects
-    tabled = dict.fromkeys([*_shown(found), choice.key, ModelKey()])
+    tabled = dict.fromkeys([*_shown(found), found.choice.key, ModelKey()])
     errors = [_scored(found, models, key, held_out) for key in tabled]
-    return {
-        "verdict": str(ModelKey(named)) if named else found.key.error or UNEXPLAINED,
-        "chosen": helps,
-        "guesses": () if (helps if timed else named) else _guesses(found),
-        "beside": tuple(n for n in helps if n not in named),
-        "misfit": _found(found, errors),
-        "p_value": found.model(choice.key).chi_square[2],
-    }
+    return {"misfit": _found(found, errors)}
 
 
-def _with_posteriors(found: Verdict, keys: Sequence[ModelKey]) -> RivalSet:
-    """Return the models with the posteriors of some of them.
+def _recorded(found: Verdict) -> list[ModelKey]:
+    """Return the models that are recorded with their posteriors."""
+    singles = [ModelKey((name,)) for name in found.rivals.effects]
+    if found.is_missed:
+        singles = [key for key in singles if key in found.search.found]
+        return [
+            *_shown(found),
+            found.choice.key,
+            ModelKey(),
+            *singles,
+            *_weights(found),
+        ]
+    p, states = found.probabilities, found.states
+    louder = [key for key in p if states.louder(key) and p[key] >= SHOWN]
+    keys = [*states.keys(ModelKey()), *_shown(found), found.key, *louder, *singles]
+    return [key for key in keys if key.error is None or not key.effects]
 
-    The bare model's comes first: what nobody declared is sized by its residual.
-    """
-    models, bare = found.rivals, ModelKey()
-    models = models.with_fits({bare: posterior(found, models, bare)})
-    fits = {key: posterior(found, models, key) for key in dict.fromkeys(keys)}
+
+def _with_posteriors(found: Verdict) -> RivalSet:
+    """Return the models with the posteriors of some of them, as they are shown."""
+    models, keys = found.rivals, dict.fromkeys(_recorded(found))
+    fits = {key: shown(found, posterior(found, models, key)) for key in keys}
     return models.with_fits(fits)
 
 
@@ -158,9 +151,13 @@ def _shown(found: Verdict) -> list[ModelKey]:
 
 
 def _guesses(found: Verdict) -> tuple[tuple[str, float], ...]:
-    known = found.search.sensor.is_known
-    is_timed = found.rivals.measurements.is_sequence
-    return guess_residual(found.search) if known or not is_timed else ()
+    """Return what the residual may follow where nothing that was declared explains."""
+    known, is_timed = found.search.sensor.is_known, found.timed
+    answered = found.named or (is_timed and found.is_missed and found.helps)
+    is_open = found.is_missed or found.key.error == UNEXPLAINED
+    if answered or not is_open or not (known or not is_timed):
+        return ()
+    return guess_residual(found.search)
 
 
 def _weights(misfit: Verdict) -> dict[ModelKey, float]:
@@ -189,9 +186,9 @@ def _found(misfit: Verdict, models: Sequence[ModelError]) -> Found:
         support=choice.support,
         open_forms=_open_forms(misfit),
         sensor=np.sqrt(m.by_channel(search.unit**2)),
-        passes=misfit.passes(choice.key),
+        passes=misfit.passes,
         size=size,
-        time_scale=time_scale if m.is_sequence else np.nan,
+        time_scale=time_scale if misfit.timed else np.nan,
         left_out="trials" if search.errors.is_by_trial else "parts of trials",
         weights={str(key): weight for key, weight in _weights(misfit).items()},
         instead=choice.instead,
@@ -204,7 +201,7 @@ def _open_forms(misfit: Verdict) -> dict[str, str]:
     Laws of friction, for example, imitate each other: while something undeclared is
     left, another form of the family, declared or not, may be what is there.
     """
-    if misfit.passes(misfit.choice.key):
+    if misfit.passes:
         return {}
     effects = misfit.rivals.effects
     named = [effects[name] for name in misfit.choice.named]

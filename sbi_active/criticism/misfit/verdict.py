@@ -36,9 +36,8 @@ from sbi_active.criticism.results import (
     Detection,
     ModelKey,
 )
-from sbi_active.criticism.steps.detection import LEVEL, THRESHOLD
+from sbi_active.criticism.steps.detection import LEVEL, RESCALED, THRESHOLD
 from sbi_active.criticism.steps.missed_trials import outlying_trials
-from sbi_active.criticism.steps.tracing import RESCALED
 from sbi_active.inference.sampling.weights import log_sum_exp
 
 
@@ -49,19 +48,13 @@ def judge(
 ) -> Verdict:
     """Return the verdict of linear models.
 
-    Before an alarm, the bare model is searched again from many starts: a mode that the
-    first search missed would be a false one.
-
     Args:
         search: Search that fits the models.
         equivalent: Groups of effects that no permitted action separates.
         rule: Rule of what helps and what is named.
     """
     search.fit_singles()
-    found = Verdict(search, equivalent, rule)
-    if found.detection.alarm and search.look_again():
-        found = Verdict(search, equivalent, rule)
-    return found
+    return Verdict(search, equivalent, rule)
 
 
 @dataclass
@@ -81,6 +74,7 @@ class Verdict:
     def __post_init__(self) -> None:
         self.rivals = self.search.rivals
         self.states = States(self.search, self.rule.chance)
+        self.timed = self.rivals.measurements.is_sequence
         self._covariances: dict[ModelKey, Array] = {}
 
     @cached_property
@@ -149,8 +143,7 @@ class Verdict:
             scored = {k: self._scored(c) for k, c in self.search.found.items()}
             return Compared(self.rule, scored, self.search.names).nothing()
         self.search.fit_larger()
-        timed = self.rivals.measurements.is_sequence
-        guessed = None if timed else partial(gained_by_guesses, self.search)
+        guessed = None if self.timed else partial(gained_by_guesses, self.search)
         return self._settled(self._scored, guessed)
 
     def _scored(
@@ -184,19 +177,18 @@ class Verdict:
                 effect gain over it; None asks none.
         """
         search, scored = self.search, dict[ModelKey, Scored]()
-        timed = self.rivals.measurements.is_sequence
         while True:
             for key, candidate in search.found.items():
                 if key not in scored:
                     scored[key] = score(candidate)
-            compared = Compared(self.rule, scored, search.names, timed)
+            compared = Compared(self.rule, scored, search.names, self.timed)
             missing = [k for top in compared.starts() for k in _missing(search, top)]
             if not missing:
                 choice = compared.choice(self.equivalent, guessed)
                 bare = scored[ModelKey()]
                 gain = scored[choice.key].gain(bare)
                 # Numbers that scatter each for itself may follow anything a little.
-                scatters = bare.state == SCATTER and not timed
+                scatters = bare.state == SCATTER and not self.timed
                 if not scatters or gain >= np.log(self.rule.decisive):
                     return choice
                 return replace(choice, key=ModelKey(), named=(), support={}, instead={})
@@ -263,9 +255,33 @@ class Verdict:
         """Return a fitted model."""
         return self.search.found[key].model
 
-    def passes(self, key: ModelKey) -> bool:
-        """Return whether a model's chi-square passes against the sensor."""
-        return self.model(key).chi_square[2] > self.rule.passes
+    @property
+    def p_value(self) -> float:
+        """Tail of the verdict's chi-square; NaN where the error has no size."""
+        key = ModelKey(self.key.effects)
+        if not self.search.sensor.is_known:
+            return float("nan")
+        return self.states.chi_square(key)[1]
+
+    @property
+    def passes(self) -> bool:
+        """Whether that chi-square passes against the sensor."""
+        return self.p_value > self.rule.passes
+
+    @property
+    def helps(self) -> tuple[str, ...]:
+        """Effects that help; of a model that explains, with those on the noise."""
+        return self.choice.key.effects if self.is_missed else self.key.effects
+
+    @property
+    def named(self) -> tuple[str, ...]:
+        """Effects that are probably the cause.
+
+        An error of no declared size that is larger explains nothing.
+        """
+        if self.is_missed:
+            return self.choice.named
+        return () if self.key.error == UNEXPLAINED else self.key.effects
 
     def beside(self, key: ModelKey) -> ModelKey:
         """Return a model in its most probable state of the error, if it has none."""

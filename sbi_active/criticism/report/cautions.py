@@ -28,7 +28,7 @@ from sbi_active.criticism.results import (
     Residuals,
     Tracing,
 )
-from sbi_active.criticism.rivals.validity import surprising_outcomes
+from sbi_active.criticism.rivals.rival import surprising_outcomes
 from sbi_active.criticism.steps.detection import REFUTED, TOO_SMALL
 from sbi_active.criticism.steps.missed_trials import outlying_trials
 from sbi_active.messages import Message

@@ -21,8 +21,7 @@ from sbi_active.criticism.results import (
     ModelKey,
     Tracing,
 )
-from sbi_active.criticism.steps.detection import LEVEL
-from sbi_active.criticism.steps.tracing import credible_set
+from sbi_active.criticism.steps.detection import LEVEL, credible_set
 from sbi_active.criticism.under_misfit import UNDECLARED, Misfit
 from sbi_active.display.page import environment
 

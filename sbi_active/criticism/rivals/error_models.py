@@ -210,10 +210,10 @@ class NoiseGrid:
             log_p[own] = NoiseGrid([alone]).log_likelihood(u[own])
         return log_p - residual.shape[1] * np.log(sizes)
 
-    def scaled(self, scales: Array, log_weights: Array) -> NoiseGrid:
-        """Return this noise with further factors on its standard deviation."""
-        product = np.multiply.outer(self.scales, scales).ravel()
-        weight = np.add.outer(self.log_scale_prior, log_weights).ravel()
+    def scaled(self, factors: Array) -> NoiseGrid:
+        """Return this noise with further factors on its size, equally likely."""
+        product = np.multiply.outer(self.scales, factors).ravel()
+        weight = np.repeat(self.log_scale_prior, len(factors))
         return replace(self, scales=product, log_weights=weight)
 
     def sized(self, sds: Sequence[Array]) -> NoiseGrid:

@@ -20,8 +20,8 @@ from sbi_active.simulation.noise.posterior import NoisePosterior, SdGrid
 NUM_TIMES, INDEPENDENT = 14, 0.3
 #: Draws that stand for a posterior over noise parameters.
 NUM_DRAWS = 24
-#: Quantiles of the inflation of the noise.
-NUM_INFLATIONS = 14
+#: Sizes of what is beside the sensor's error in its deviations, a factor apart.
+SMALLEST, LARGEST, FACTOR = 0.3, 40.0, 1.63
 
 
 def declared_noise(
@@ -120,11 +120,18 @@ def measurement_sds(noise: NoiseModel | None, measurements: Measurements) -> Any
 
 
 def scattered(noise: NoiseGrid) -> NoiseGrid:
-    """Return the noise inflated by 1 + |N(0, 2.5^2)|, summed out by its quantiles."""
-    levels = torch.arange(0.5, NUM_INFLATIONS) / NUM_INFLATIONS
-    half_normal = torch.distributions.Normal(0.0, 1.0).icdf(0.5 + 0.5 * levels)
-    factors = 1 + 2.5 * half_normal.double().numpy()
-    return noise.scaled(factors, np.full(NUM_INFLATIONS, -np.log(NUM_INFLATIONS)))
+    """Return the noise with an error of unknown size besides, summed out."""
+    return noise.scaled(np.hypot(1, sizes(LARGEST)))
+
+
+def sizes(largest: float) -> Array:
+    """Return sizes of what is beside the sensor's error, in its deviations.
+
+    Args:
+        largest: The largest one.
+    """
+    num = 1 + round(np.log(largest / SMALLEST) / np.log(FACTOR))
+    return np.geomspace(SMALLEST, largest, num)
 
 
 def _correlated(

@@ -16,8 +16,8 @@ from sbi_active.criticism.evidence.rival_set import RivalSet
 from sbi_active.criticism.results import ModelKey, Residuals
 from sbi_active.criticism.rivals.error_models import LOG_2PI
 from sbi_active.criticism.rivals.residual_process import ResidualProcess
+from sbi_active.criticism.rivals.rival import log_outcomes
 from sbi_active.criticism.rivals.trial_simulator import TrialSimulator
-from sbi_active.criticism.rivals.validity import log_outcomes
 from sbi_active.inference.sampling.weights import log_sum_exp
 from sbi_active.seeding import derive_seed, forked_generators
 
@@ -50,33 +50,28 @@ def conditioned(
     size = np.sqrt(np.mean((own / rivals.noise.typical_sd) ** 2))
     unit = error.typical_sd * max(size, 1e-3)
     c, first = rival.coordinates, is_first_part(m, rivals.warm_up)
-    num_own = c.num_own
+    own = c.trial_of() >= 0
     z = np.zeros((len(u), c.dim))
-    z[:, :num_own] = fit.rival.coordinates.to_z(u)[:, :num_own]
+    z[:, ~own] = fit.rival.coordinates.to_z(u)[:, : c.num_own]
     draws = c.from_z(z)
-    draws[:, num_own:] = c.center[num_own:]
-    point = draws.mean(0, keepdims=True)
+    draws[:, own] = c.center[own]
+    point, precision = draws.mean(0, keepdims=True), np.maximum(c.precision[own], 1e-6)
 
     def whiten(residual: Array) -> Array:
-        return residual / unit
+        return np.where(first, residual / unit, 0.0)
 
-    blocks = [
-        (np.flatnonzero(c.trial_of() == t), np.flatnonzero(first & (m.trial == t)))
-        for t in range(len(simulator))
-    ]
-    gains: list[tuple[Array, Array]] = []
-    for _ in range(4):  # Gauss-Newton steps
+    for again in range(5):  # Gauss-Newton steps, the last one of each draw
         r, jacobian = rival.jacobian(point, whiten, rivals.step)
-        gains = [_gain(jacobian[0], c.precision, *block) for block in blocks]
-        _correct(point, r, c.center, c.precision, blocks, gains)
+        slope = jacobian[0][:, own]
+        cov = np.linalg.inv(slope.T @ slope + np.diag(precision))
+        if again == 4:
+            draws[:, own] = point[:, own]
+            point, r = draws, whiten(rival.residual(draws)[0])
+        pull = (point[:, own] - c.center[own]) * c.precision[own]
+        point[:, own] -= (r @ slope + pull) @ cov
         point = np.clip(point, c.low, c.high)
-    draws[:, num_own:] = point[:, num_own:]
-    r = whiten(rival.residual(draws)[0])
-    _correct(draws, r, c.center, c.precision, blocks, gains)
-    for (columns, _), (_, cov) in zip(blocks, gains, strict=True):
-        factor = np.linalg.cholesky(cov)
-        draws[:, columns] += rng.normal(size=(len(u), len(columns))) @ factor.T
-    return c.split(np.clip(draws, c.low, c.high))
+    point[:, own] += rng.normal(size=(len(u), own.sum())) @ np.linalg.cholesky(cov).T
+    return c.split(np.clip(point, c.low, c.high))
 
 
 def is_first_part(m: Measurements, warm_up: float) -> NDArray[np.bool_]:
@@ -84,30 +79,6 @@ def is_first_part(m: Measurements, warm_up: float) -> NDArray[np.bool_]:
     begin = np.full(m.shape[0], np.inf)
     np.minimum.at(begin, m.trial, m.time)
     return m.time - begin[m.trial] < warm_up
-
-
-def _gain(
-    jacobian: Array, precision: Array, columns: Array, rows: Array
-) -> tuple[Array, Array]:
-    """Return the response of nuisances to the first part's residual, and their cov."""
-    part = jacobian[np.ix_(rows, columns)]
-    prior = np.diag(np.maximum(precision[columns], 1e-6))
-    cov = np.linalg.inv(part.T @ part + prior)
-    return cov @ part.T, cov
-
-
-def _correct(
-    u: Array,
-    residual: Array,
-    center: Array,
-    precision: Array,
-    blocks: list[tuple[Array, Array]],
-    gains: list[tuple[Array, Array]],
-) -> None:
-    """Take a Gauss-Newton step of each trial's nuisances, in place."""
-    for (columns, rows), (gain, cov) in zip(blocks, gains, strict=True):
-        pull = (u[:, columns] - center[columns]) * precision[columns]
-        u[:, columns] -= residual[:, rows] @ gain.T + pull @ cov
 
 
 #: A choice: each draw costs a simulation of every trial.
@@ -257,14 +228,14 @@ def predict(
     if errs is not None:
         extra = errs.sizes[m.channel]
         sd = np.zeros(mean.shape) if spread is None else np.where(missing, spread, 0.0)
-        errors = sd * rng.normal(size=mean.shape)
+        errors = errs.errors(m, num_draws, rng) + sd * rng.normal(size=mean.shape)
     else:
         assert own_residual is not None
         cells, sizes = fit.error.noise_posterior(own_residual, rng)
         errors, sd = noise.errors(cells, sizes, rng)
         errors, sd = errors * factor, sd * factor
+        errors = errors + extra * rng.normal(size=mean.shape)
     sd = np.sqrt(sd**2 + extra**2)
-    errors = errors + extra * rng.normal(size=mean.shape)
     each = np.empty((num_draws, len(target) if scored else 0))
     for t in range(each.shape[1]):
         at = (m.trial == t) & ~drops

@@ -9,7 +9,6 @@ from torch.distributions import Independent, Normal, Uniform
 from sbi_active import GaussianNoise, SimulatorModel, StudentTNoise
 from sbi_active.criticism import Criticism, Trials
 from sbi_active.criticism.evidence.rival_set import RivalSet
-from sbi_active.criticism.linear.model import linearize, reweighted_at
 from sbi_active.criticism.linear.screening import linear_models
 from sbi_active.criticism.misfit.verdict import judge
 from sbi_active.criticism.results import ModelKey
@@ -144,17 +143,3 @@ def test_jumps_count_as_noise_and_an_effect_beside_them_is_named():
     assert not loop.rivals.is_smooth
     assert loop.trace().verdict == "wave"
     assert loop.rivals.simulator.num_simulations < 50_000 * 12
-
-
-def test_weights_of_t_errors_at_another_point_are_those_of_a_model_there():
-    """Of a curve that is linear in its parameters, without a simulation."""
-    model = SimulatorModel(curve, noise=StudentTNoise(SD, 4.0))
-    some = RivalSet(model, PRIOR, Trials(ACTION, measured()), [], seed=0)
-    rival, unit = some.rival(BARE, df=4.0), np.full(12, SD)
-    here, there = (
-        linearize(rival, np.array(u), unit) for u in ((0.2, 0.3), (0.9, -0.5))
-    )
-    moved = reweighted_at(here, there.u, 4.0)
-    for name in ("residual", "jacobian", "scale", "offset"):
-        own, expected = getattr(moved, name), getattr(there, name)
-        np.testing.assert_allclose(own, expected, atol=1e-5, err_msg=name)

@@ -6,8 +6,8 @@ from sbi.utils import BoxUniform
 
 from sbi_active import GaussianNoise, SimulatorModel
 from sbi_active.criticism import Criticism, Trials
+from sbi_active.criticism.steps.detection import log_priors
 from sbi_active.criticism.steps.equivalence import MANY
-from sbi_active.criticism.steps.tracing import log_priors
 from tests.effects import louder, on_outcomes
 
 TIMES = torch.linspace(0, 2, 30)

@@ -47,6 +47,11 @@ def criticism(low, *, high=1.0, effect=GAIN, fn=stop, drag=0.0, prior=None):
     return Criticism(model, prior, trials, effects=[effect], seed=0)
 
 
+def beyond(loop, tracing):
+    loop.trace()
+    return beyond_bounds(loop._verdict, loop.rivals, tracing)
+
+
 def codes(report):
     return {w.code for w in report.warnings}
 
@@ -90,14 +95,14 @@ def test_a_bound_of_phi_is_told_and_its_null_is_none():
     strong = Effect.keyword("drag", prior=prior)
     loop = criticism(0.1, effect=strong, drag=0.3)
     assert loop.trace().chosen == ("drag",)
-    tracing = beyond_bounds(loop.rivals, replace(loop.trace(), chosen=("drag",)))
+    tracing = beyond(loop, replace(loop.trace(), chosen=("drag",)))
     # Asked first of all, it has the posteriors as well.
     assert criticism(0.1, effect=strong, drag=0.3).judged(None).bounds.parameters
     (found,) = [p for p in tracing.bounds.parameters if p.name == "drag"]
     assert (found.model, found.side) == ("drag", "upper")
     assert found.beyond > 0.15
     weak = criticism(0.1, effect=Effect.keyword("drag", prior=prior))
-    told = beyond_bounds(weak.rivals, replace(weak.trace(), chosen=("drag",)))
+    told = beyond(weak, replace(weak.trace(), chosen=("drag",)))
     assert told.bounds.parameters == ()
 
 
@@ -110,7 +115,7 @@ def test_a_simulator_that_refuses_what_is_beyond_is_asked_no_more():
     loop = criticism(0.5)
     loop.trace()
     loop.rivals.simulator.model.base.fn = refusing
-    found = beyond_bounds(loop.rivals, loop.trace())
+    found = beyond(loop, loop.trace())
     (only,) = found.bounds.parameters
     assert np.isnan(only.beyond)
     assert np.isnan(found.bounds.p_value)

@@ -39,7 +39,6 @@ def evidence(name: str, log_evidence: float) -> Evidence:
         engine="least squares",
         names=names,
         draws=0.3 + 0.01 * rng.normal(size=(400, len(names))),
-        best_chi_square=40.0,
     )
 
 

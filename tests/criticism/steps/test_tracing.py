@@ -12,8 +12,8 @@ from sbi_active.criticism.evidence.rival_set import RivalSet
 from sbi_active.criticism.misfit.evaluation import evaluate_held_out, evaluate_left_out
 from sbi_active.criticism.misfit.record import traced
 from sbi_active.criticism.results import ModelKey
+from sbi_active.criticism.steps.detection import log_prior, log_priors
 from sbi_active.criticism.steps.predictive import find_residuals
-from sbi_active.criticism.steps.tracing import log_prior, log_priors
 from tests.criticism.steps import linear_world
 from tests.criticism.steps.linear_world import (
     ACTION,
