@@ -16,6 +16,7 @@ from sbi_active.design.estimators.base import (
     CandidateSimulations,
     InformationGainEstimator,
     at_least,
+    noise_scale,
 )
 from sbi_active.seeding import forked_generators
 
@@ -97,7 +98,7 @@ class EntropyGain(InformationGainEstimator):
         significant: float = 4.0,
         max_kurtosis: float = 0.3,
     ) -> list[str]:
-        r"""Test by pairs whether undeclared noise is Gaussian.
+        r"""Test by pairs whether undeclared noise is Gaussian, and for steps.
 
         Standardized differences of pairs have an excess kurtosis of zero, with a
         standard error of :math:`\sqrt{24 / n}`, under Gaussian noise.
@@ -110,7 +111,7 @@ class EntropyGain(InformationGainEstimator):
         """
         if int(simulations.complete.sum(1).max()) < few:
             return [f"fewer than {few} complete outcomes a candidate"]
-        problems = presence_problems(simulations)
+        problems = presence_problems(simulations) + self.steps(simulations)
         if simulations.noise is not None or simulations.replicate is None:
             return problems
         pooled = [
@@ -127,6 +128,49 @@ class EntropyGain(InformationGainEstimator):
             *problems,
             f"noise is not Gaussian, excess kurtosis of pairs {excess:.1f}",
         ]
+
+    def steps(
+        self, simulations: CandidateSimulations, *, most: float = 0.1, few: int = 3
+    ) -> list[str]:
+        """Say whether outcomes are on steps, each of too few of them.
+
+        The neighbors of one lie on other steps then, and what is between counts as
+        filled: of a hundred steps the gain was up to 1.7 nats too large.
+
+        Args:
+            simulations: Simulations to look at; nothing is said without declared noise.
+            most: Share of an action's outcomes that may be on such steps.
+            few: Outcomes of a step, in those of the neighbors, that are too few: an
+                estimate rests on half of the simulations.
+        """
+        worst, means = 0.0, simulations.mean
+        for a, rows in enumerate(simulations.complete if means is not None else ()):
+            assert means is not None
+            value, step, size = torch.unique(
+                means[a, rows].flatten(1),
+                dim=0,
+                return_inverse=True,
+                return_counts=True,
+            )
+            is_few = (size > 1) & (size <= few * self.num_neighbors)
+            share = float(is_few[step].double().sum() / len(rows))
+            if share > worst and _are_apart(value / noise_scale(simulations)[a]):
+                worst = share
+        if worst <= most:
+            return []
+        return [
+            f"{worst:.0%} of an action's outcomes are on steps of too few for nearest "
+            "neighbors"
+        ]
+
+
+def _are_apart(value: Tensor) -> bool:
+    """Whether most distinct outcomes (n, q), in deviations of the noise, differ by one.
+
+    Those that single precision made alike do not.
+    """
+    apart = torch.cdist(value, value).fill_diagonal_(torch.inf).amin(1)
+    return float(apart.median()) > 1
 
 
 def conditional_entropy(

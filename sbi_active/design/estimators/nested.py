@@ -211,8 +211,8 @@ class NestedGain(InformationGainEstimator):
                 than the noise. Gains are right with .54 in a saturated oscillator, and
                 one to six nats too large with .65 to 1 of two-joint arms.
         """
-        if simulations.noise is None:
-            return False
+        if simulations.noise is None or EntropyGain().steps(simulations):
+            return False  # of steps there are none
         some = simulations.samples(slice(num_rows))
         error = _emulator(some, noise_scale(simulations)).error
         missed = (error.abs() > 1).unflatten(1, (len(simulations.x), -1)).any(2)
