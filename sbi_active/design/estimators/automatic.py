@@ -122,10 +122,12 @@ def choose_estimator(
             linear = LinearGain(max_bent=MAX_BENT)
             if linear.suits(simulations, num_rows or len(simulations.theta)):
                 return linear, []
-        if isinstance(by_noise, EntropyGain) and by_noise.steps(simulations):
-            notes = [f"EntropyGain not used: {by_noise.steps(simulations)[0]}"]
-            by_noise = NestedGain()
         problems = by_noise.problems(simulations)
+        steps = EntropyGain().steps(simulations) if problems else []
+        if steps and isinstance(by_noise, EntropyGain):
+            notes = [f"EntropyGain not used: {steps[0]}"]
+            by_noise = NestedGain()
+            problems = by_noise.problems(simulations)
         if not problems:
             return by_noise, notes
         notes += [f"{type(by_noise).__name__} not used: {text}" for text in problems]

@@ -143,34 +143,22 @@ class EntropyGain(InformationGainEstimator):
             few: Outcomes of a step, in those of the neighbors, that are too few: an
                 estimate rests on half of the simulations.
         """
-        worst, means = 0.0, simulations.mean
-        for a, rows in enumerate(simulations.complete if means is not None else ()):
-            assert means is not None
-            value, step, size = torch.unique(
-                means[a, rows].flatten(1),
-                dim=0,
-                return_inverse=True,
-                return_counts=True,
-            )
+        if simulations.mean is None:
+            return []
+        white = simulations.mean.flatten(2).double() / noise_scale(simulations)[:, None]
+        worst, total = 0.0, white.sum(2)  # the same where outcomes are
+        for own, rows in zip(total, simulations.complete, strict=True):
+            value, size = torch.unique(own[rows], return_counts=True)
             is_few = (size > 1) & (size <= few * self.num_neighbors)
-            share = float(is_few[step].double().sum() / len(rows))
-            if share > worst and _are_apart(value / noise_scale(simulations)[a]):
-                worst = share
+            # Outcomes that single precision made alike are no steps.
+            if len(value) > 1 and float(value.diff().median()) > 1:
+                worst = max(worst, float(size[is_few].sum() / len(rows)))
         if worst <= most:
             return []
         return [
             f"{worst:.0%} of an action's outcomes are on steps of too few for nearest "
             "neighbors"
         ]
-
-
-def _are_apart(value: Tensor) -> bool:
-    """Whether most distinct outcomes (n, q), in deviations of the noise, differ by one.
-
-    Those that single precision made alike do not.
-    """
-    apart = torch.cdist(value, value).fill_diagonal_(torch.inf).amin(1)
-    return float(apart.median()) > 1
 
 
 def conditional_entropy(
