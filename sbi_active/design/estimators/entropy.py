@@ -130,7 +130,7 @@ class EntropyGain(InformationGainEstimator):
         ]
 
     def steps(
-        self, simulations: CandidateSimulations, *, most: float = 0.1, few: int = 3
+        self, simulations: CandidateSimulations, *, most: float = 0.1, few: float = 3
     ) -> list[str]:
         """Say whether outcomes are on steps, each of too few of them.
 
@@ -146,19 +146,34 @@ class EntropyGain(InformationGainEstimator):
         if simulations.mean is None:
             return []
         white = simulations.mean.flatten(2).double() / noise_scale(simulations)[:, None]
-        worst, total = 0.0, white.sum(2)  # the same where outcomes are
-        for own, rows in zip(total, simulations.complete, strict=True):
-            value, size = torch.unique(own[rows], return_counts=True)
-            is_few = (size > 1) & (size <= few * self.num_neighbors)
-            # Outcomes that single precision made alike are no steps.
-            if len(value) > 1 and float(value.diff().median()) > 1:
-                worst = max(worst, float(size[is_few].sum() / len(rows)))
+        worst, weight = 0.0, torch.arange(1, white.shape[2] + 1).double().sqrt()
+        for own, rows in zip(white, simulations.complete, strict=True):
+            # One number is the same where outcomes are, and sorted soon.
+            _, step, size = torch.unique(
+                own[rows] @ weight, return_inverse=True, return_counts=True
+            )
+            share = float(size[(size > 1) & (size <= few * self.num_neighbors)].sum())
+            if share > worst * len(rows) and _are_apart(own[rows], step):
+                worst = share / len(rows)
         if worst <= most:
             return []
         return [
-            f"{worst:.0%} of an action's outcomes are on steps of too few for nearest "
-            "neighbors"
+            f"{worst:.0%} of an action's outcomes are on steps, so few on each that "
+            "estimates are too high"
         ]
+
+
+def _are_apart(outcome: Tensor, step: Tensor) -> bool:
+    """Whether most steps are apart by more than the noise, not by a rounding error.
+
+    Args:
+        outcome: Outcomes in deviations of their noise, shape (n, q).
+        step: Number of each one's step, shape (n,).
+    """
+    first = torch.zeros_like(step).scatter_(0, step, torch.arange(len(step)))
+    one = outcome[first[: int(step.max()) + 1]]
+    apart = torch.cdist(one, one).fill_diagonal_(torch.inf).amin(1)
+    return float(apart.median()) > 1
 
 
 def conditional_entropy(

@@ -143,3 +143,19 @@ def test_outcomes_on_a_hundred_steps_are_left_to_nested_monte_carlo() -> None:
     assert "on steps" in design.notes[0]
     gain = design.expected_information_gain
     assert float((gain - math.log(100)).abs().max()) < 0.3
+
+
+def test_flat_steps_have_no_slopes_that_correct_a_gain() -> None:
+    """Of sixteen steps it was .5 nat too low; of nine hundred it says that it errs."""
+    prior = BoxUniform(torch.zeros(2), torch.ones(2))
+    designer = InformationGainDesigner(DiscreteActions([0.0, 1.0]), num_samples=750)
+
+    def design(num):
+        stairs = SimulatorModel(
+            lambda theta, action: (num * theta).floor(), noise=GaussianNoise(0.05)
+        )
+        return designer.select(None, stairs, belief=prior, seed=0)
+
+    gain = design(4).expected_information_gain
+    assert float((gain - math.log(16)).abs().max()) < 0.1
+    assert "on steps" in design(30).notes[0]
