@@ -89,12 +89,12 @@ class Race:
         in_reach = mean + reach * paired_errors(contributions, leader) >= mean[leader]
         return Race(leader, best.double() / num_draws, regret, in_reach)
 
-    def reason(self, *, sure: float = 0.95, negligible: float = 0.05) -> str | None:
+    def reason(self, negligible: float, *, sure: float = 0.95) -> str | None:
         """Return why no further simulations are needed; None if they are.
 
         Args:
-            sure: Probability that the leader is the best, at which to stop.
             negligible: Expected loss at which to stop, nats.
+            sure: Probability that the leader is the best, at which to stop.
         """
         if float(self.probability_best[self.leader]) > sure:
             return "leader separated"
@@ -224,6 +224,7 @@ class GainEvaluator:
         *,
         num_samples: int,
         share: float,
+        negligible: float,
         notes: Sequence[str] = (),
         most: int = 4,
     ) -> Design:
@@ -234,6 +235,7 @@ class GainEvaluator:
             budget: Simulations in all, those so far included.
             num_samples: Simulations a candidate on average.
             share: Share of these that every candidate gets at first.
+            negligible: Expected loss at which to stop, nats.
             notes: Notes on the candidates, the last of the design's.
             most: Times ``num_samples`` that a candidate may get at most.
         """
@@ -270,7 +272,7 @@ class GainEvaluator:
             keep = race.in_reach
             spent = 2 * len(halves[0].theta) * runs
             more = affordable(min(spent, most * num_samples - spent), int(keep.sum()))
-            stopped = race.reason() or ("budget spent" if more < 8 else None)
+            stopped = race.reason(negligible) or ("budget spent" if more < 8 else None)
             if stopped is not None:
                 break
             active = active[keep]

@@ -44,7 +44,7 @@ class DesignLimits:
     ) -> None:
         self.actions, self.constraint, self.least = actions, constraint, least
         self._price: Any = price
-        self.is_sequential = _takes_previous(price)
+        self.is_sequential = takes_second(price, "previous")
         self.previous: Tensor | None = None
         self.left = math.inf
 
@@ -162,8 +162,8 @@ class DesignLimits:
         return (note,) if num else ()
 
 
-def _takes_previous(price: Any) -> bool:
-    """Whether a cost has an argument ``previous``, or needs a second one."""
-    own = [p for p in parameters_of(price) if p.kind < p.VAR_POSITIONAL]
+def takes_second(function: Any, name: str = "") -> bool:
+    """Whether a function needs a second argument, or has one of a name."""
+    own = [p for p in parameters_of(function) if p.kind < p.VAR_POSITIONAL]
     needed = [p for p in own if p.default is p.empty]
-    return len(needed) > 1 or "previous" in [p.name for p in own]
+    return len(needed) > 1 or name in [p.name for p in own]

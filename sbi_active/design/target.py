@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -14,6 +13,7 @@ from sbi_active.design.estimators.automatic import find_estimator
 from sbi_active.design.estimators.base import InformationGainEstimator
 from sbi_active.design.estimators.linear import LinearGain
 from sbi_active.design.estimators.posterior import ParameterGain
+from sbi_active.design.limits import takes_second
 from sbi_active.seeding import forked_generators
 from sbi_active.simulation import Simulations
 
@@ -195,7 +195,7 @@ class Quantity:
     def _value(self, theta: Tensor) -> Tensor:
         """Return what the function returns, checked, shape (n, k), float64."""
         given = [theta.clone()]
-        if _takes_effects(self.function):
+        if takes_second(self.function):
             sizes = [effect.phi_dim for effect in self._effects]
             base, *phi = theta.clone().split([theta.shape[1] - sum(sizes), *sizes], 1)
             names = [effect.name for effect in self._effects]
@@ -211,14 +211,3 @@ class Quantity:
                 "each row, such as the largest loss where a controller fails"
             )
         return value
-
-
-def _takes_effects(function: Callable[..., Any]) -> bool:
-    """Whether a function needs a second argument."""
-    try:
-        inspect.signature(function).bind("theta")
-    except TypeError:
-        return True
-    except ValueError:  # some of C have no signature
-        return False
-    return False

@@ -27,7 +27,7 @@ from benchmarks.misfit.summary import summary
 from benchmarks.robustness.run import by_tests
 from benchmarks.rows import read
 from benchmarks.search import run as search
-from benchmarks.target import run as target
+from benchmarks.target import cart_pole as target
 from sbi_active.tasks import cascaded_tanks
 from tests.criticism.misfit.oscillator import EFFECTS, MODEL, PRIOR, trials
 

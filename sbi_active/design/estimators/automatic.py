@@ -94,7 +94,8 @@ def choose_estimator(
 ) -> tuple[InformationGainEstimator, list[str]]:
     """Return the first estimator whose assumptions pass their checks.
 
-    With declared noise it is entropies if x is one number, the linear estimate of more
+    With declared noise it is entropies if x is one number that takes no few values, the
+    linear estimate of more
     than twelve parameters that x is linear in, else nested Monte Carlo.
     With replicates it is entropies for one or two numbers, else nested Monte Carlo on
     the smoothed outcomes. If checks fail, it depends on the model: the bound of a
@@ -122,9 +123,14 @@ def choose_estimator(
             if linear.suits(simulations, num_rows or len(simulations.theta)):
                 return linear, []
         problems = by_noise.problems(simulations)
+        steps = EntropyGain().steps(simulations) if problems else []
+        if steps and isinstance(by_noise, EntropyGain):
+            notes = [f"EntropyGain not used: {steps[0]}"]
+            by_noise = NestedGain()
+            problems = by_noise.problems(simulations)
         if not problems:
-            return by_noise, []
-        notes = [f"{type(by_noise).__name__} not used: {text}" for text in problems]
+            return by_noise, notes
+        notes += [f"{type(by_noise).__name__} not used: {text}" for text in problems]
     if hasattr(model, "log_posterior"):
         return PosteriorGain(), notes
     if hasattr(model, "log_likelihood"):

@@ -181,7 +181,8 @@ class LikelihoodGain(_Critic):
 
     @override
     def bound_on(self, model: Any) -> Bound:
-        return "upper" if getattr(model, "exact_likelihood", False) else "none"
+        exact = getattr(model, "exact_likelihood", False)
+        return "upper" if exact and not self.own else self.bound
 
     @override
     def _others(
@@ -268,7 +269,3 @@ class InfoNCEGain(LikelihoodGain):
 
     def __init__(self, *, num_contrastive: int = 127) -> None:
         super().__init__(num_contrastive=num_contrastive)
-
-    @override
-    def bound_on(self, model: Any) -> Bound:
-        return self.bound

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from sbi_active.design.estimators.base import CandidateSimulations
+from sbi_active.design.estimators.base import CandidateSimulations, noise_scale
 from sbi_active.seeding import forked_generators
 from sbi_active.simulation import GaussianNoise
 
@@ -173,23 +173,42 @@ RIDGES = tuple(10.0**k for k in range(-5, 2))
 
 
 @dataclass(frozen=True)
-class Learned:
-    """Simulations of a learned model, and what it was learned by.
+class Emulated:
+    """Simulations whose noise is declared or learned, and the emulator of their means.
 
     Attributes:
-        simulations: Simulations in whitened coordinates with mean and noise, x of shape
-            (a, n, q).
-        emulator: Emulator of the means, a * q outcomes.
-        score: Leave-one-out mean squares over their expectation under the noise, near 1
-            where smoothing misses nothing, shape (a, q).
+        simulations: Simulations with mean and noise, x of shape (a, n, q) where these
+            are learned.
+        emulator: Emulator of the means in units of the noise, a * q outcomes.
+        scale: Root mean square of the noise of each number, shape (a, q).
+        missed: Whether the emulator misses an outcome that it was not fitted to by more
+            than the noise, shape (a, n).
     """
 
     simulations: CandidateSimulations
     emulator: MeanEmulator
-    score: Tensor
+    scale: Tensor
+    missed: Tensor
+
+    def columns(self, a: int) -> slice:
+        """Return the outcomes of a candidate in the emulator."""
+        q = self.scale.shape[1]
+        return slice(a * q, (a + 1) * q)
 
 
-def declare(simulations: CandidateSimulations) -> Learned:
+def emulated(simulations: CandidateSimulations) -> Emulated:
+    """Return declared simulations with their emulator, or learned ones."""
+    if simulations.noise is None:
+        return learned(simulations)
+    assert simulations.mean is not None
+    theta, scale = simulations.theta.double(), noise_scale(simulations)
+    filled = fill(theta, simulations.mean.flatten(2).double()) / scale[:, None]
+    emulator = MeanEmulator.fit(theta, filled.transpose(0, 1).flatten(1))
+    missed = emulator.error.unflatten(1, scale.shape).square().mean(2).T > 1
+    return Emulated(simulations, emulator, scale, missed)
+
+
+def learned(simulations: CandidateSimulations) -> Emulated:
     r"""Return simulations of a model learned from pairs, whose noise is declared.
 
     The noise of a candidate is Gaussian with the covariance of the pairs' differences,
@@ -199,7 +218,7 @@ def declare(simulations: CandidateSimulations) -> Learned:
 
     Averages of pairs, whitened by L, are smoothed over theta (:class:`MeanEmulator`).
     Outcomes are drawn anew, :math:`\hat f(\theta_i) + \epsilon_i`, so that none had a
-    part in its own mean.
+    part in its own mean. Averages are off by the noise, so that none counts as missed.
     """
     assert simulations.replicate is not None
     theta, complete = simulations.theta.double(), simulations.complete
@@ -228,8 +247,8 @@ def declare(simulations: CandidateSimulations) -> Learned:
     declared = replace(
         simulations, x=x, mean=mean, noise=GaussianNoise(1.0), replicate=None
     )
-    square = emulator.error.square().mean(0)
-    return Learned(declared, emulator, 2 * square.reshape(num_actions, q))
+    one, none = torch.ones(num_actions, q).double(), torch.zeros(num_actions, n).bool()
+    return Emulated(declared, emulator, one, none)
 
 
 def fill(theta: Tensor, x: Tensor) -> Tensor:

@@ -16,6 +16,7 @@ from sbi_active.design.estimators.base import (
     CandidateSimulations,
     InformationGainEstimator,
     at_least,
+    noise_scale,
 )
 from sbi_active.seeding import forked_generators
 
@@ -97,7 +98,7 @@ class EntropyGain(InformationGainEstimator):
         significant: float = 4.0,
         max_kurtosis: float = 0.3,
     ) -> list[str]:
-        r"""Test by pairs whether undeclared noise is Gaussian.
+        r"""Test by pairs whether undeclared noise is Gaussian, and for steps.
 
         Standardized differences of pairs have an excess kurtosis of zero, with a
         standard error of :math:`\sqrt{24 / n}`, under Gaussian noise.
@@ -110,7 +111,7 @@ class EntropyGain(InformationGainEstimator):
         """
         if int(simulations.complete.sum(1).max()) < few:
             return [f"fewer than {few} complete outcomes a candidate"]
-        problems = presence_problems(simulations)
+        problems = presence_problems(simulations) + self.steps(simulations)
         if simulations.noise is not None or simulations.replicate is None:
             return problems
         pooled = [
@@ -127,6 +128,52 @@ class EntropyGain(InformationGainEstimator):
             *problems,
             f"noise is not Gaussian, excess kurtosis of pairs {excess:.1f}",
         ]
+
+    def steps(
+        self, simulations: CandidateSimulations, *, most: float = 0.1, few: float = 3
+    ) -> list[str]:
+        """Say whether outcomes are on steps, each of too few of them.
+
+        The neighbors of one lie on other steps then, and what is between counts as
+        filled: of a hundred steps the gain was up to 1.7 nats too large.
+
+        Args:
+            simulations: Simulations to look at; nothing is said without declared noise.
+            most: Share of an action's outcomes that may be on such steps.
+            few: Outcomes of a step, in those of the neighbors, that are too few: an
+                estimate rests on half of the simulations.
+        """
+        if simulations.mean is None:
+            return []
+        white = simulations.mean.flatten(2).double() / noise_scale(simulations)[:, None]
+        worst, weight = 0.0, torch.arange(1, white.shape[2] + 1).double().sqrt()
+        for own, rows in zip(white, simulations.complete, strict=True):
+            # One number is the same where outcomes are, and sorted soon.
+            _, step, size = torch.unique(
+                own[rows] @ weight, return_inverse=True, return_counts=True
+            )
+            share = float(size[(size > 1) & (size <= few * self.num_neighbors)].sum())
+            if share > worst * len(rows) and _are_apart(own[rows], step):
+                worst = share / len(rows)
+        if worst <= most:
+            return []
+        return [
+            f"{worst:.0%} of an action's outcomes are on steps, so few on each that "
+            "estimates are too high"
+        ]
+
+
+def _are_apart(outcome: Tensor, step: Tensor) -> bool:
+    """Whether most steps are apart by more than the noise, not by a rounding error.
+
+    Args:
+        outcome: Outcomes in deviations of their noise, shape (n, q).
+        step: Number of each one's step, shape (n,).
+    """
+    first = torch.zeros_like(step).scatter_(0, step, torch.arange(len(step)))
+    one = outcome[first[: int(step.max()) + 1]]
+    apart = torch.cdist(one, one).fill_diagonal_(torch.inf).amin(1)
+    return float(apart.median()) > 1
 
 
 def conditional_entropy(

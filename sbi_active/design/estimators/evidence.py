@@ -4,34 +4,30 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 
 import torch
 from torch import Tensor
 from torch.distributions import Distribution
 
-from sbi_active.design.estimators.emulator import MeanEmulator
+from sbi_active.design.estimators.emulator import Emulated, MeanEmulator
 from sbi_active.seeding import forked_generators
 from sbi_active.simulation import GaussianNoise, NoiseModel
 from sbi_active.support import within_support
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class Evidence:
     """The log evidence of outcomes of one candidate, log p(x_i).
 
+    Outcomes near a simulation that the emulator misses are taken to be linear from its
+    own, by the emulator's slope.
+
     Attributes:
-        emulator: Emulator of the noise-free outcomes.
-        columns: Columns of the candidate in it.
-        missed: Whether the emulator misses an outcome that it was not fitted to by more
-            than the noise, shape (n,). Outcomes near such a simulation are taken to be
-            linear from its own, by the emulator's slope.
-        mean: Noise-free outcomes of the simulations.
-        scale: Scale of the noise of each number.
+        known: Simulations and the emulator of their outcomes without noise.
+        candidate: Number of the candidate.
         share: Share of each simulation's outcomes that are complete, shape (n,).
-        counted: Simulations that are not missing, shape (n,), bool.
-        noise: Noise around the mean.
         belief: Belief over the parameters.
-        log_belief: Log density of the belief at the simulations.
         num_local: Number of local draws.
         degrees: Degrees of freedom of the Student-t proposals; even.
         wider: Width of the proposals, in those of the linearized posterior.
@@ -42,16 +38,10 @@ class Evidence:
         rare: Relative variance of an evidence that rests on a draw or two.
     """
 
-    emulator: MeanEmulator
-    columns: slice
-    missed: Tensor
-    mean: Tensor
-    scale: Tensor
+    known: Emulated
+    candidate: int
     share: Tensor
-    counted: Tensor
-    noise: NoiseModel
     belief: Distribution
-    log_belief: Tensor
     num_local: int
     degrees: int = 6
     wider: float = 1.2
@@ -60,14 +50,39 @@ class Evidence:
     closer: float = 0.2
     rare: float = 0.5
 
-    @property
+    @cached_property
+    def mean(self) -> Tensor:
+        """Outcomes of the simulations without noise."""
+        assert self.known.simulations.mean is not None
+        return self.known.simulations.mean[self.candidate].double()
+
+    @cached_property
+    def noise(self) -> NoiseModel:
+        """Noise around the mean."""
+        assert self.known.simulations.noise is not None
+        return self.known.simulations.noise
+
+    @cached_property
+    def counted(self) -> Tensor:
+        """Simulations that are not missing, shape (n,), bool."""
+        return self.known.simulations.counted[self.candidate]
+
+    @cached_property
+    def scale(self) -> Tensor:
+        """Scale of the noise of each number."""
+        return self.known.scale[self.candidate]
+
+    @cached_property
     def knots(self) -> Tensor:
         """Coordinates of the simulations, shape (n, d)."""
-        return self.emulator.knots
+        return self.known.emulator.knots
 
-    def __call__(
-        self, x: Tensor, slope: Tensor, rows: Tensor
-    ) -> tuple[Tensor, Tensor, Tensor]:
+    @cached_property
+    def log_belief(self) -> Tensor:
+        """Log density of the belief at the simulations."""
+        return _log_belief(self.belief, self.known.emulator, self.knots)
+
+    def __call__(self, slope: Tensor, rows: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         r"""Return log evidences without Jensen's bias, and what they rest on.
 
         That is the share of each simulation in them, summed over the outcomes, and the
@@ -79,6 +94,7 @@ class Evidence:
             p(x_i) \ge p(x_i | \theta_i)\, b(\theta_i)\, (\pi / 2)^{d / 2}
             \left| J^\top J + \Sigma^{-1} \right|^{-1/2} .
         """
+        x = self.known.simulations.x[self.candidate].double()
         m, num_local = int(self.counted.sum()) - 1, self.num_local
         parts = []
         influence, local = torch.zeros(2, len(self.knots), dtype=torch.float64)
@@ -127,7 +143,9 @@ class Evidence:
         start = self.knots[i][:, None]
         z = torch.where(near, start + self.closer * step, location[:, None] + step)
         flat = z.flatten(0, 1)
-        log_b = log_belief(self.belief, self.emulator, flat).reshape(n, num_local)
+        log_b = _log_belief(self.belief, self.known.emulator, flat).reshape(
+            n, num_local
+        )
         inside = torch.nonzero(log_b.flatten().isfinite())[:, 0]
         mean = self._outcomes(z, slope, i).flatten(0, 1)[inside] * self.scale
         outcome = x.repeat_interleave(num_local, 0)[inside]
@@ -146,10 +164,13 @@ class Evidence:
 
     def _outcomes(self, z: Tensor, slope: Tensor, i: Tensor) -> Tensor:
         """Noise-free outcomes at z (i, k, d) around simulations i, (i, k, q)."""
-        found = self.emulator(z.flatten(0, 1), self.columns).unflatten(0, z.shape[:2])
+        found = self.known.emulator(z.flatten(0, 1), self.known.columns(self.candidate))
+        found = found.unflatten(0, z.shape[:2])
         own = (self.mean[i].flatten(1) / self.scale)[:, None]
         straight = own + (z - self.knots[i][:, None]) @ slope.mT
-        return torch.where(self.missed[i][:, None, None], straight, found)
+        return torch.where(
+            self.known.missed[self.candidate, i][:, None, None], straight, found
+        )
 
     def _log_complete(self, z: Tensor) -> Tensor:
         """Log probability of a complete outcome, that of the nearest simulation."""
@@ -217,7 +238,7 @@ def _pairwise(noise: NoiseModel, x: Tensor, mean: Tensor) -> Tensor:
     return paired.reshape(n, k)
 
 
-def log_belief(belief: Distribution, emulator: MeanEmulator, z: Tensor) -> Tensor:
+def _log_belief(belief: Distribution, emulator: MeanEmulator, z: Tensor) -> Tensor:
     """Log density of the belief in the emulator's coordinates, shape (n,)."""
     theta = emulator.parameters(z).float()
     inside = within_support(belief, theta)

@@ -2,6 +2,7 @@ r"""Information gain by nested Monte Carlo, local draws through an emulator."""
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import torch
@@ -13,9 +14,8 @@ from sbi_active.design.estimators.base import (
     CandidateSimulations,
     InformationGainEstimator,
     at_least,
-    noise_scale,
 )
-from sbi_active.design.estimators.emulator import MeanEmulator, declare, fill
+from sbi_active.design.estimators.emulator import emulated, learned
 from sbi_active.design.estimators.entropy import (
     EntropyGain,
     conditional_entropy,
@@ -24,8 +24,7 @@ from sbi_active.design.estimators.entropy import (
     presence_problems,
     with_control,
 )
-from sbi_active.design.estimators.evidence import Evidence, log_belief, precision_of
-from sbi_active.simulation import NoiseModel
+from sbi_active.design.estimators.evidence import Evidence, precision_of
 
 
 class NestedGain(InformationGainEstimator):
@@ -64,7 +63,7 @@ class NestedGain(InformationGainEstimator):
     three thousandths of the belief.
 
     Where noise is not declared, mean and noise are first learned from pairs of outcomes
-    at the same parameters (:func:`.declare`):
+    at the same parameters (:func:`.learned`):
     Gaussian noise of one covariance a candidate, and an outcome smooth in theta. The
     estimate is then the information of the learned model; its standard errors are
     without the error of learning.
@@ -91,59 +90,28 @@ class NestedGain(InformationGainEstimator):
         self, model: Any, simulations: CandidateSimulations, belief: Distribution
     ) -> Tensor:
         gain = presence_information(simulations)
-        shares, counted = simulations.completeness, simulations.counted
-        enough = _enough(simulations).tolist()
-        learned = declare(simulations) if simulations.noise is None else None
-        if learned is not None:
-            simulations = learned.simulations
-        mean, noise = _declared(simulations)
-        entropy, surprise = conditional_entropy(simulations)
-        q = mean[0, 0].numel()
-        if learned is None:
-            scale = noise_scale(simulations)
-            emulator = _emulator(simulations, scale)
-        else:
-            scale, emulator = torch.ones(len(mean), q).double(), learned.emulator
-        slopes, error = emulator.slope(emulator.knots), emulator.error
-        missed = error.unflatten(1, (-1, q)).square().mean(2) > 1
-        if learned is not None:  # its error is the noise's
-            missed = torch.zeros_like(missed)
-        for a, share in enumerate(shares):
-            if not enough[a]:
-                continue  # too few measurements: what is present still counts
+        shares, fisher = simulations.completeness, simulations.fisher
+        known = emulated(simulations)
+        entropy, surprise = conditional_entropy(known.simulations)
+        slopes = known.emulator.slope(known.emulator.knots)
+        # Too few measurements: what is present still counts.
+        for a in torch.nonzero(_enough(simulations))[:, 0].tolist():
+            share, counted = shares[a], simulations.counted[a]
             rows = share > 0
-            evidence = Evidence(
-                emulator=emulator,
-                columns=slice(a * q, (a + 1) * q),
-                missed=missed[:, a],
-                mean=mean[a].double(),
-                scale=scale[a],
-                share=share,
-                counted=counted[a],
-                noise=noise,
-                belief=belief,
-                log_belief=log_belief(belief, emulator, emulator.knots),
-                num_local=self.num_local,
-            )
-            own = slopes[:, evidence.columns]
-            log_p, influence, local = evidence(
-                simulations.x[a].double(), own, torch.nonzero(rows)[:, 0]
-            )
-            log_p -= share[counted[a]].mean().log()
+            own = slopes[:, known.columns(a)]
+            evidence = Evidence(known, a, share, belief, self.num_local)
+            log_p, influence, local = evidence(own, torch.nonzero(rows)[:, 0])
+            log_p -= share[counted].mean().log()
             gain[a, rows] += share[rows] * with_control(
                 -log_p - entropy[a, rows], surprise[a, rows] - entropy[a, rows]
             )
-            if simulations.fisher is not None:
-                gain[a] -= _excess(
-                    own @ emulator.transform.T,
-                    simulations.fisher[a].double(),
-                    simulations.theta.double(),
-                    local,
-                )
+            if fisher is not None:
+                slope, theta = own @ known.emulator.transform.T, simulations.theta
+                gain[a] -= _excess(slope, fisher[a].double(), theta.double(), local)
             # What a simulation does to the evidence of others has mean zero: it adds to
             # errors and leaves the estimate.
-            effect = torch.where(counted[a], share - influence, 0.0)
-            gain[a] += effect - counted[a] * effect[counted[a]].mean()
+            effect = torch.where(counted, share - influence, 0.0)
+            gain[a] += effect - counted * effect[counted].mean()
         return gain
 
     @override
@@ -187,12 +155,14 @@ class NestedGain(InformationGainEstimator):
             return [f"fewer than {needed} complete outcomes a candidate"]
         if simulations.noise is None:
             problems = EntropyGain().problems(simulations)
-            missed = declare(simulations).score > 2
+            missed = learned(simulations).emulator.error.square().mean(0) > 1
             share = float(missed.double().mean())
             if share > 0.5:
                 problems.append(f"smoothing misses {share:.0%} of the numbers of x")
             return problems
-        return presence_problems(simulations)
+        is_one = simulations.x[0, 0].numel() == 1  # then .2 nat too high at most
+        steps = [] if is_one else EntropyGain().steps(simulations)
+        return presence_problems(simulations) + steps
 
     @override
     def needs_slopes(
@@ -211,10 +181,10 @@ class NestedGain(InformationGainEstimator):
                 than the noise. Gains are right with .54 in a saturated oscillator, and
                 one to six nats too large with .65 to 1 of two-joint arms.
         """
-        if simulations.noise is None:
-            return False
+        if simulations.noise is None or EntropyGain().steps(simulations, few=math.inf):
+            return False  # steps have none
         some = simulations.samples(slice(num_rows))
-        error = _emulator(some, noise_scale(simulations)).error
+        error = emulated(some).emulator.error
         missed = (error.abs() > 1).unflatten(1, (len(simulations.x), -1)).any(2)
         return float(missed.double().mean(0).max()) > most
 
@@ -242,22 +212,9 @@ def _excess(slope: Tensor, fisher: Tensor, theta: Tensor, local: Tensor) -> Tens
     return found
 
 
-def _emulator(simulations: CandidateSimulations, scale: Tensor) -> MeanEmulator:
-    """Return the emulator of declared outcomes in units of their noise (a, q)."""
-    theta, (mean, _) = simulations.theta.double(), _declared(simulations)
-    filled = fill(theta, mean.flatten(2).double()) / scale[:, None]
-    return MeanEmulator.fit(theta, filled.transpose(0, 1).flatten(1))
-
-
 def _enough(simulations: CandidateSimulations, fewest: int = 8) -> Tensor:
     """Whether complete outcomes suffice to compare, or to learn from, shape (a,)."""
     needed = fewest
     if simulations.noise is None:
         needed = max(fewest, simulations.x[0, 0].numel() + 2)
     return simulations.complete.sum(1) >= needed
-
-
-def _declared(simulations: CandidateSimulations) -> tuple[Tensor, NoiseModel]:
-    assert simulations.mean is not None
-    assert simulations.noise is not None
-    return simulations.mean, simulations.noise

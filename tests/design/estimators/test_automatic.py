@@ -1,9 +1,13 @@
 """The estimator that is chosen by checks, and what is said of its estimate."""
 
+import math
+
 import pytest
 import torch
+from sbi.utils import BoxUniform
 from torch.distributions import Distribution
 
+from sbi_active import DiscreteActions, InformationGainDesigner, SimulatorModel
 from sbi_active.design import LikelihoodGain, LinearGain, PosteriorGain, RatioGain
 from sbi_active.design.estimators.automatic import (
     choose_estimator,
@@ -125,3 +129,33 @@ def test_a_ratio_whose_normalization_is_off_is_noticed():
 def test_a_former_name_is_taken_for_one_version(former, name, kind):
     with pytest.warns(DeprecationWarning, match=f'use estimator="{name}"'):
         assert type(find_estimator(former)) is kind
+
+
+def test_outcomes_on_a_hundred_steps_are_left_to_nested_monte_carlo() -> None:
+    """Nearest neighbors were .8 nat too high: what is between steps counted."""
+    prior = BoxUniform(torch.zeros(1), torch.ones(1))
+    stairs = SimulatorModel(
+        lambda theta, action: (100 * theta).floor(), noise=GaussianNoise(0.05)
+    )
+    designer = InformationGainDesigner(DiscreteActions([0.0, 1.0]), num_samples=750)
+    design = designer.select(None, stairs, belief=prior, seed=0)
+    assert design.estimator == "NestedGain"
+    assert "on steps" in design.notes[0]
+    gain = design.expected_information_gain
+    assert float((gain - math.log(100)).abs().max()) < 0.3
+
+
+def test_flat_steps_have_no_slopes_that_correct_a_gain() -> None:
+    """Of sixteen steps it was .5 nat too low; of nine hundred it says that it errs."""
+    prior = BoxUniform(torch.zeros(2), torch.ones(2))
+    designer = InformationGainDesigner(DiscreteActions([0.0, 1.0]), num_samples=750)
+
+    def design(num):
+        stairs = SimulatorModel(
+            lambda theta, action: (num * theta).floor(), noise=GaussianNoise(0.05)
+        )
+        return designer.select(None, stairs, belief=prior, seed=0)
+
+    gain = design(4).expected_information_gain
+    assert float((gain - math.log(16)).abs().max()) < 0.1
+    assert "on steps" in design(30).notes[0]
