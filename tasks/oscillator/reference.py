@@ -79,6 +79,7 @@ class OscillatorReference(SampledPosterior):
         return -0.5 * squares / self.noise_sd**2 - OUTCOMES * scale
 
     def sample(self, num: int, *, seed: int | None = None) -> Tensor:
+        """Return draws, shape (num, 4), of the prior itself without trials."""
         if len(self.x):
             return super().sample(num, seed=seed)
         with forked_generators(seed, "reference"):

@@ -13,7 +13,7 @@ from torch.distributions import Distribution
 
 from sbi_active.arrays import measured
 from sbi_active.criticism.data.arrays import rows_at
-from sbi_active.expected import require, require_one_of, suggests
+from sbi_active.expected import require, suggests
 from sbi_active.inference.beliefs.priors import is_discrete
 from sbi_active.seeding import forked_generators
 from sbi_active.support import parts_of, support_of
@@ -233,7 +233,10 @@ def _require_parts(effect: Effect) -> None:
     require(is_continuous, f"{expected} {own}", "a discrete one", advice)
     expected = f"apply {own} as a function of (value, phi, action, context)"
     require(callable(effect.apply), expected, repr(effect.apply), "pass one")
-    require_one_of(effect, hook=get_args(Hook), scope=SCOPES)
+    for part, known in (("hook", get_args(Hook)), ("scope", SCOPES)):
+        value = getattr(effect, part)
+        expected = f"{part} among {', '.join(map(repr, known))}"
+        require(value in known, expected, repr(value), "choose one of these")
 
 
 def _sound_null(effect: Effect) -> Any:
