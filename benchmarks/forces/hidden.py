@@ -49,7 +49,7 @@ class OutsideForce:
     def __call__(self, q: Array, v: Array, t: float, phi: Array) -> Array:
         """Return the force, shape (n, joints)."""
         joint, force = self.joint, np.zeros_like(v)
-        at, speed = q[:, joint.place] / joint.position, v[:, joint.dof] / joint.velocity
+        at, speed = q[:, joint.dof] / joint.position, v[:, joint.dof] / joint.velocity
         force[:, joint.dof] = self.size * phi[:, 0] * OUTSIDE[self.form](at, speed)
         return force
 
