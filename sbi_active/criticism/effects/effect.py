@@ -187,15 +187,7 @@ class Effect:
 
     def log_prob(self, phi: Tensor) -> Tensor:
         """Return the log prior density, shape (n,), float64; -inf outside."""
-        shape = self.prior.batch_shape + self.prior.event_shape
-        value = phi.reshape(len(phi), *shape)
-        inside = support_of(self.prior).check(value)[:, None].flatten(1).all(-1)
-        # Outside of its support a distribution raises or gives what it likes.
-        with forked_generators(0, "inside"):
-            some = self.prior.sample()
-        safe = torch.where(inside.reshape(-1, *[1] * len(shape)), value, some)
-        density = self.prior.log_prob(safe).double()[:, None].flatten(1).sum(-1)
-        return density.where(inside, -torch.inf)
+        return log_density_within(self.prior, phi).double()
 
     def null_phi(self, num: int, *, finite: bool = False) -> Tensor:
         """Return the null in each row, shape (num, phi_dim), float64."""
@@ -203,6 +195,21 @@ class Effect:
         if finite:
             null = torch.nan_to_num(null, posinf=LARGE, neginf=-LARGE)
         return null.expand(self.phi_dim).repeat(num, 1)
+
+
+def log_density_within(prior: Distribution, rows: Tensor) -> Tensor:
+    """Return log densities of rows (n, k), -inf outside, shape (n,), with gradients.
+
+    Outside of its support a distribution raises or gives what it likes.
+    """
+    shape = prior.batch_shape + prior.event_shape
+    value = rows.reshape(len(rows), *shape)
+    inside = support_of(prior).check(value)[:, None].flatten(1).all(-1)
+    with forked_generators(0, "inside"):
+        some = prior.sample()
+    safe = torch.where(inside.reshape(-1, *[1] * len(shape)), value, some)
+    density = prior.log_prob(safe)[:, None].flatten(1).sum(-1)
+    return density.where(inside, -torch.inf)
 
 
 @dataclass(frozen=True)

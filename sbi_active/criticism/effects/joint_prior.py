@@ -10,9 +10,12 @@ from torch import Tensor
 from torch.distributions import Distribution, constraints
 from typing_extensions import override
 
-from sbi_active.criticism.effects.effect import Effect, require_distinct
+from sbi_active.criticism.effects.effect import (
+    Effect,
+    log_density_within,
+    require_distinct,
+)
 from sbi_active.expected import require
-from sbi_active.seeding import kept_generators
 from sbi_active.support import support_of
 
 
@@ -68,14 +71,10 @@ class JointPrior(Distribution):
     def log_prob(self, value: Tensor) -> Tensor:
         rows = value.reshape(-1, sum(self.sizes))
         theta, *phi = rows.split(self.sizes, -1)
-        inside = support_of(self.prior).check(theta)[:, None].flatten(1).all(-1)
-        with kept_generators():  # any place in the support will do
-            place = self.prior.sample(torch.Size([1]))
-        safe = torch.where(inside[:, None], theta, place)
-        total = self.prior.log_prob(safe)[:, None].flatten(1).sum(-1)
+        total = log_density_within(self.prior, theta)
         for effect, part in zip(self.effects, phi, strict=True):
             total = total + effect.log_prob(part).to(total.dtype)
-        return total.where(inside, -torch.inf).reshape(value.shape[:-1])
+        return total.reshape(value.shape[:-1])
 
     def _parts(self) -> list[Distribution]:
         return [self.prior, *[effect.prior for effect in self.effects]]

@@ -24,6 +24,7 @@ from sbi_active.criticism.report.sections import (
 )
 from sbi_active.criticism.results import NONE, Evaluation
 from sbi_active.criticism.steps.predictive import find_residuals
+from sbi_active.design.design import action_labels
 from sbi_active.display.figures import legible
 from sbi_active.display.notebook import card, items, table
 from sbi_active.plain import plain
@@ -190,19 +191,16 @@ def build_report(
         loop: The comparison, as in :func:`.cautions`.
         **parts: Parts of :class:`.Contents`.
     """
-    labels = [f"action {i + 1}" for i in range(trials.action.shape[1])]
-    if trials.action_labels is not None:
-        labels = trials.action_labels
-    elif actions is not None:
-        pairs = zip(actions.names, actions.units, strict=True)
-        labels = [f"{name} [{unit}]" if unit else name for name, unit in pairs]
+    labels = trials.action_labels or (actions and action_labels(actions))
+    if labels is None:
+        labels = tuple(f"action {i + 1}" for i in range(trials.action.shape[1]))
     channels = trials.channel_labels or parts["simulator"].channel_names
     report = Report(
         **parts,
         warnings=(),
         exploratory=exploratory,
         num_trials=len(trials.fit),
-        action_labels=tuple(labels),
+        action_labels=labels,
         action_is_label=trials.action_is_label,
         channel_names=None if channels is None else tuple(channels),
     )
