@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -68,6 +69,8 @@ class Fit:
         evidence: Evidence that is recorded of it.
         best: Point from which other trials are predicted, shape (dim,); None takes the
             draws.
+        linear: Function from u (n, dim) to the residuals (n, N) of the linear model
+            that draws are of; None if they are of the simulator's own posterior.
         known: Mask of the numbers that it is fitted to, shape (N,); None for all.
         spread: Errors of its predictions if every model misses; None else.
     """
@@ -76,6 +79,7 @@ class Fit:
     sample: WeightedDraws
     evidence: Evidence
     best: Array | None = None
+    linear: Callable[[Array], Array] | None = None
     known: NDArray[np.bool_] | None = None
     spread: Spread | None = None
 
@@ -108,6 +112,34 @@ class Fit:
         weight = normalized(log_w)
         own = replace(own, weight=weight, effective_sample_size=effective)
         return replace(some, sample=own)
+
+    def weighed(
+        self, u: Array, residual: Array, rng: np.random.Generator
+    ) -> tuple[Array, Array]:
+        """Return draws of a linear model, weighed by the simulator where it bends.
+
+        Along the valley of two parameters that make up for each other a Gaussian
+        leaves it soon. None is weighed up to a deviation of the log density ratio of
+        half a nat; and since few draws would make for a narrow interval, weights leave
+        a fifth of them at least, by a power of them.
+
+        Args:
+            u: Draws, shape (n, dim).
+            residual: Residuals of the simulator there, of the numbers that it is fitted
+                to, shape (n, N).
+            rng: Source of what is drawn from them.
+        """
+        if self.linear is None:
+            return u, residual
+        error, linear_residual = self.error, self.linear(u)
+        if self.known is not None:
+            linear_residual = linear_residual[:, self.known]
+        log_w = error.log_likelihood(residual) - error.log_likelihood(linear_residual)
+        log_w = np.nan_to_num(log_w, nan=-1e9, neginf=-1e9, posinf=-1e9)
+        if log_w.std() < 0.5:
+            return u, residual
+        at = rng.choice(len(u), size=len(u), p=tempered(log_w, 0.2 * len(u)))
+        return u[at], residual[at]
 
 
 def tempered(log_w: Array, fewest: float) -> Array:

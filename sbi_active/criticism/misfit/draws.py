@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,6 +13,7 @@ from sbi_active.arrays import Array
 from sbi_active.criticism.evidence.fit import Fit, Spread
 from sbi_active.criticism.evidence.rival_set import NUM_DRAWS, RivalSet
 from sbi_active.criticism.linear.fits import refitted
+from sbi_active.criticism.linear.model import LinearModel
 from sbi_active.criticism.linear.search import Search
 from sbi_active.criticism.misfit.verdict import Verdict
 from sbi_active.criticism.results import FEW_DRAWS, OUTLIER, ModelKey
@@ -29,8 +32,7 @@ def posterior(
 
     The bare model and that of the verdict have samples of the simulator's own posterior
     where they bend and do not miss; of few effective draws a linear model's, since a
-    few would claim to know what is open. Others predict from their best fit, as far as
-    they may bend.
+    few would claim to know what is open.
 
     Args:
         found: Verdict with the model.
@@ -42,18 +44,15 @@ def posterior(
     search, whole = found.search, models.fits.get(key)
     if use is not None and whole is not None and whole.evidence.engine != "linear":
         return whole.by(use[search.errors.fold])
-    if found.is_missed or found.states.louder(key):
+    is_shown = key in (ModelKey(), found.key) and key in search.found
+    if found.is_missed or not is_shown or not bends(search, key):
         return _linear(found, models, key, use, at_best=found.is_missed)
-    if key not in search.found:  # beside an error that is not the sensor's
-        return _linear(found, models, key, use, at_best=False)
-    is_shown = key in (ModelKey(), found.key)
-    is_bent = not is_shown or bends(search, key)
-    if is_bent and is_shown and use is None and not found.misses(key):
+    if use is None and not found.misses(key):
         fit = models.sampled(key, search.model(key).u[None])
         if fit.evidence.effective_sample_size >= FEW_DRAWS:
             log_z = found.states.log_evidence(key)
             return replace(fit, evidence=replace(fit.evidence, log_evidence=log_z))
-    return _linear(found, models, key, use, at_best=is_bent)
+    return _linear(found, models, key, use, at_best=found.misses(key))
 
 
 def shown(found: Verdict, fit: Fit) -> Fit:
@@ -129,6 +128,7 @@ def _linear(
     model = search.model(states.predicting(key))
     seed = derive_seed(models.seed, "linear", str(model.key))
     best, spread = None, None
+    linear: Callable[[Array], Array] | None = None
 
     def drawn(center: Array, cov: Array) -> Array:
         return model.draws(center, cov, NUM_DRAWS, np.random.default_rng(seed))
@@ -147,8 +147,11 @@ def _linear(
         if beside.error == OUTLIER:
             at = states.mixture(beside, use)
         u = drawn(at.mean if best is None else best, at.cov)
+        if best is None:
+            linear = partial(_residual, search.unit, model)
         if states.louder(key):
             u = _with_louder(rival, u, states.louder_draws(key, use)[0])
+            linear = None
     sample = WeightedDraws(
         u=u,
         weight=np.full(NUM_DRAWS, 1 / NUM_DRAWS),
@@ -158,7 +161,7 @@ def _linear(
         method="linear",
     )
     evidence = models.record(rival, sample, u)
-    return Fit(rival, sample, evidence, best, known, spread)
+    return Fit(rival, sample, evidence, best, linear, known, spread)
 
 
 def spread_of(
@@ -191,6 +194,11 @@ def spread_of(
     count = np.bincount(fold[kept], minlength=len(told))[told]
     time = errors.process(own.beside)[1] if found.timed else 0.0
     return Spread(np.sqrt(square), total / count, time)
+
+
+def _residual(unit: Array, model: LinearModel, u: Array) -> Array:
+    """Return residuals of a linear model, (n, N), of coordinates (n, d)."""
+    return unit * model.scale * model.at(u)[:, : model.num]
 
 
 def _with_louder(rival: Rival, u: Array, phi: Array) -> Array:

@@ -173,6 +173,7 @@ def predict(
         own_residual = rival.residual(u, penalized=False)[0]
         if fit.known is not None:
             own_residual = own_residual[:, fit.known]
+        u, own_residual = fit.weighed(u, own_residual, rng)
     if is_linear:
         jumps = not rivals.is_smooth or rivals.roughness.any()
         near = 1.0 if jumps or rivals.simulator.is_stochastic else near
