@@ -18,6 +18,7 @@ from sbi_active.criticism.linear.search import Search
 from sbi_active.criticism.misfit.verdict import Verdict
 from sbi_active.criticism.results import FEW_DRAWS, OUTLIER, ModelKey
 from sbi_active.criticism.rivals.rival import Rival
+from sbi_active.criticism.steps.detection import THRESHOLD
 from sbi_active.inference.engine import WeightedDraws
 from sbi_active.seeding import derive_seed
 
@@ -30,9 +31,9 @@ def posterior(
 ) -> Fit:
     """Return a model with draws of its posterior.
 
-    The bare model and that of the verdict have samples of the simulator's own posterior
-    where they bend and do not miss; of few effective draws a linear model's, since a
-    few would claim to know what is open.
+    The bare model and those that are likely have samples of the simulator's own
+    posterior where they bend and do not miss; of few effective draws a linear model's,
+    since a few would claim to know what is open.
 
     Args:
         found: Verdict with the model.
@@ -44,8 +45,7 @@ def posterior(
     search, whole = found.search, models.fits.get(key)
     if use is not None and whole is not None and whole.evidence.engine != "linear":
         return whole.by(use[search.errors.fold])
-    is_shown = key in (ModelKey(), found.key) and key in search.found
-    if found.is_missed or not is_shown or not bends(search, key):
+    if found.is_missed or not _is_likely(found, key) or not bends(search, key):
         return _linear(found, models, key, use, at_best=found.is_missed)
     if use is None and not found.misses(key):
         fit = models.sampled(key, search.model(key).u[None])
@@ -53,6 +53,21 @@ def posterior(
             log_z = found.states.log_evidence(key)
             return replace(fit, evidence=replace(fit.evidence, log_evidence=log_z))
     return _linear(found, models, key, use, at_best=found.misses(key))
+
+
+def _is_likely(found: Verdict, key: ModelKey) -> bool:
+    """Return whether a model is bare, the verdict's, or one that actions are to tell.
+
+    Simulations along trajectories, and of random simulators, are dear.
+    """
+    states, rivals = found.states, found.rivals
+    if key in (ModelKey(), found.key) or key not in found.search.found:
+        return key in found.search.found
+    if found.timed or rivals.simulator.is_stochastic or len(key.effects) > 1:
+        return False
+    every = [*found.search.found, *states.keys(ModelKey())]
+    least = max(map(states.log_evidence, every)) - THRESHOLD
+    return states.log_evidence(key) >= least
 
 
 def shown(found: Verdict, fit: Fit) -> Fit:
