@@ -157,9 +157,42 @@ THOROUGH = SearchSettings(
 )
 
 
-def settings_of(num_trials: int) -> Settings:
-    """Return the settings of a sample: 9,000 rows of so many simulated trials."""
-    return Settings(plenty=4.0, num_simulations=9_000 * num_trials)
+#: Searches with a fit to begin at.
+NESTED = SearchSettings(
+    num_screened=32,
+    num_starts=4,
+    max_starts=12,
+    num_found=1,
+    explained=0.0,
+    iterations=6,
+    phases=10,
+)
+
+
+def settings_of(num_trials: int, *, is_bare: bool) -> Settings:
+    """Return the settings of what is spent on a sample.
+
+    The bare model is every comparison's other side, and its posterior is shown; of
+    others fifty effective draws are enough.
+
+    Args:
+        num_trials: Number of simulated trials in a row.
+        is_bare: Whether it is the model without effects.
+    """
+    most = 3_000  # rows of all trials
+    if is_bare:
+        return Settings(plenty=4.0, num_simulations=3 * most * num_trials)
+    return Settings(
+        num_effective=50.0,
+        plenty=1.0,
+        divergence=np.inf,
+        num_draws=100,
+        fewest=25.0,
+        affordable=5.0,
+        broad=60.0,
+        share_of_plenty=0.0,
+        num_simulations=most * num_trials,
+    )
 
 
 #: Finite-difference steps in prior deviations, and where two of them count as one; a

@@ -19,6 +19,7 @@ from sbi_active.criticism.data.trials import Trials
 from sbi_active.criticism.effects.augmented import AugmentedSimulator
 from sbi_active.criticism.effects.effect import Effect
 from sbi_active.criticism.evidence.fit import (
+    NESTED,
     STEPS,
     THOROUGH,
     Fit,
@@ -256,9 +257,9 @@ class RivalSet:
         """
         rival, seed = self.rival(key), derive_seed(self.seed, "evidence", str(key))
         repeats = NUM_REPLICATES if self.simulator.is_stochastic else 1
-        settings = settings_of(len(self.trials) * repeats)
+        settings = settings_of(len(self.trials) * repeats, is_bare=key == ModelKey())
         rng = np.random.default_rng(derive_seed(self.seed, "search", str(key)))
-        found = search(rival, rng, near, THOROUGH)
+        found = search(rival, rng, near, THOROUGH if near is None else NESTED)
         rng = np.random.default_rng(seed)
         sample = infer(rival, rng, found=found, settings=settings)
         if not len(sample.u):  # nothing has a likelihood

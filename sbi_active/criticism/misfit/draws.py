@@ -18,6 +18,7 @@ from sbi_active.criticism.linear.search import Search
 from sbi_active.criticism.misfit.verdict import Verdict
 from sbi_active.criticism.results import FEW_DRAWS, OUTLIER, ModelKey
 from sbi_active.criticism.rivals.rival import Rival
+from sbi_active.criticism.steps.detection import THRESHOLD
 from sbi_active.inference.engine import WeightedDraws
 from sbi_active.seeding import derive_seed
 
@@ -30,9 +31,9 @@ def posterior(
 ) -> Fit:
     """Return a model with draws of its posterior.
 
-    The bare model and that of the verdict have samples of the simulator's own posterior
-    where they bend and do not miss; of few effective draws a linear model's, since a
-    few would claim to know what is open.
+    The bare model and those that are likely have samples of the simulator's own
+    posterior where they bend and do not miss; of few effective draws a linear model's,
+    since a few would claim to know what is open.
 
     Args:
         found: Verdict with the model.
@@ -41,19 +42,32 @@ def posterior(
         key: Key of the model.
         use: Parts of the trials that count, shape (f,); None takes all.
     """
-    search = found.search
-    if use is not None:
-        whole = models.fits.get(key)
-        if whole is not None and whole.evidence.engine != "linear":
-            return whole.by(use[search.errors.fold])
-        return _linear(found, models, key, use)
-    is_shown = key in (ModelKey(), found.key) and key in search.found
-    if is_shown and not found.misses(key) and bends(search, key):
+    search, whole = found.search, models.fits.get(key)
+    if use is not None and whole is not None and whole.evidence.engine != "linear":
+        return whole.by(use[search.errors.fold])
+    if found.is_missed or not _is_likely(found, key) or not bends(search, key):
+        return _linear(found, models, key, use, at_best=found.is_missed)
+    if use is None and not found.misses(key):
         fit = models.sampled(key, search.model(key).u[None])
         if fit.evidence.effective_sample_size >= FEW_DRAWS:
             log_z = found.states.log_evidence(key)
             return replace(fit, evidence=replace(fit.evidence, log_evidence=log_z))
-    return _linear(found, models, key)
+    return _linear(found, models, key, use, at_best=found.misses(key))
+
+
+def _is_likely(found: Verdict, key: ModelKey) -> bool:
+    """Return whether a model is bare, the verdict's, or one that actions are to tell.
+
+    Simulations along trajectories, and of random simulators, are dear.
+    """
+    states, rivals = found.states, found.rivals
+    if key in (ModelKey(), found.key) or key not in found.search.found:
+        return key in found.search.found
+    if found.timed or rivals.simulator.is_stochastic or len(key.effects) > 1:
+        return False
+    every = [*found.search.found, *states.keys(ModelKey())]
+    least = max(map(states.log_evidence, every)) - THRESHOLD
+    return states.log_evidence(key) >= least
 
 
 def shown(found: Verdict, fit: Fit) -> Fit:
@@ -107,7 +121,9 @@ def _linear(
     found: Verdict,
     models: RivalSet,
     key: ModelKey,
-    use: NDArray[np.bool_] | None = None,
+    use: NDArray[np.bool_] | None,
+    *,
+    at_best: bool,
 ) -> Fit:
     """Return a linear model with its draws as its posterior sample.
 
@@ -119,6 +135,7 @@ def _linear(
         models: The verdict's models.
         key: Key of the model, with an error or with effects on the noise.
         use: Parts of the trials that count, shape (f,); None takes all.
+        at_best: Whether trials are predicted from the best fit.
     """
     states, search = found.states, found.search
     known = None if use is None else use[search.errors.fold]
@@ -131,17 +148,22 @@ def _linear(
     def drawn(center: Array, cov: Array) -> Array:
         return model.draws(center, cov, NUM_DRAWS, np.random.default_rng(seed))
 
-    if found.is_missed:
-        log_z, best = search.found[key].beside.log_evidence, model.u
+    if at_best:
+        best = model.u
         if known is not None:
             best = refitted(search.rival(key), model, search.units, known)
+    if found.is_missed:
+        assert best is not None
+        log_z = search.found[key].beside.log_evidence
         u, spread = drawn(best, found.covariance(key)), spread_of(found, key, use)
     else:
         at = states.mixture(key, use)
         log_z, beside = at.log_evidence, found.beside(key)
         if beside.error == OUTLIER:
             at = states.mixture(beside, use)
-        u, linear = drawn(at.mean, at.cov), partial(_residual, search.unit, model)
+        u = drawn(at.mean if best is None else best, at.cov)
+        if best is None:
+            linear = partial(_residual, search.unit, model)
         if states.louder(key):
             u = _with_louder(rival, u, states.louder_draws(key, use)[0])
             linear = None

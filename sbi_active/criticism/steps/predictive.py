@@ -168,17 +168,17 @@ def predict(
     rng = np.random.default_rng(derive_seed(seed, "predictive", str(key)))
     u, own_residual = sample.draws(num_draws, rng), None
     errs = fit.spread
-    is_linear = errs is not None and (trials is None or not rivals.nuisances)
+    is_linear = fit.best is not None and (trials is None or not rivals.nuisances)
+    if errs is None:
+        own_residual = rival.residual(u, penalized=False)[0]
+        if fit.known is not None:
+            own_residual = own_residual[:, fit.known]
+        u, own_residual = fit.weighed(u, own_residual, rng)
     if is_linear:
         jumps = not rivals.is_smooth or rivals.roughness.any()
         near = 1.0 if jumps or rivals.simulator.is_stochastic else near
         assert fit.best is not None
         u = fit.best + near * np.concatenate([np.zeros((1, rival.dim)), u - fit.best])
-    elif errs is None:
-        own_residual = rival.residual(u, penalized=False)[0]
-        if fit.known is not None:
-            own_residual = own_residual[:, fit.known]
-        u, own_residual = fit.weighed(u, own_residual, rng)
     target = rivals.trials if trials is None else trials
     simulator = TrialSimulator(
         rivals.simulator.model, target, seed=derive_seed(rivals.seed, "predicted")
@@ -200,12 +200,12 @@ def predict(
     noise, at_best = rivals.noise_of(m), None
     if is_linear:
         at_best, mean = mean[0], mean[0] + (mean[1:] - mean[0]) / near
-        probability, unit = probability[1:], None
+        probability, unit = probability[1:], None if unit is None else unit[1:]
         phi = {name: value[1:] for name, value in phi.items()}
         at_best = np.where(np.isfinite(at_best), at_best, mean.mean(0))
-    if errs is not None:
+    if errs is not None:  # whose sizes are those of all errors
         middle = mean.mean(0) if at_best is None else at_best
-        mean = middle + errs.scale * (mean - middle)
+        mean, unit = middle + errs.scale * (mean - middle), None
     factor = simulator.noise_scale(phi, num_draws)
     factor = np.ones_like(mean) if factor is None else factor
     factor = factor if unit is None else factor * unit

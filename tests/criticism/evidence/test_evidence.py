@@ -83,7 +83,7 @@ def inferred(seed=0, **given):
     rival, rng = rivals().rival(ModelKey()), np.random.default_rng(seed)
     found = search(rival, rng, settings=THOROUGH)
     vars(rival).update(given)
-    return infer(rival, rng, found=found, settings=settings_of(8))
+    return infer(rival, rng, found=found, settings=settings_of(8, is_bare=False))
 
 
 def test_the_standard_error_claims_what_repeated_runs_show():
