@@ -5,6 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from itertools import product
 from typing import Any
 
 import torch
@@ -172,16 +173,25 @@ class CandidateSampler:
         missing = _if_any(missing)
         return CandidateSimulations(theta, action, x, mean, noise, missing=missing)
 
-    def _means(self, theta: Tensor, action: Tensor, key: str) -> tuple[Tensor, Tensor]:
-        """Return noise-free outcomes (a, n, *x_shape) and which are missing (a, n)."""
+    def _means(
+        self, theta: Tensor, action: Tensor, key: str, *, block: int = 768
+    ) -> tuple[Tensor, Tensor]:
+        """Return noise-free outcomes (a, n, *x_shape) and which are missing (a, n).
+
+        Long ones are kept in memory for so many rows of an action at a time: of 10,000
+        numbers these take some 200 MB.
+        """
         assert isinstance(self.simulator, SimulatorModel)
-        short, means, lost = self.summaries, [], []
-        # Many numbers are kept in memory for one action at a time.
-        for some in action.split(len(action) if short is None else 1):
-            mean, missing = self._run(self.simulator.mean, theta, some, key)
-            means.append(mean if short is None else short(some[0], mean[0])[None])
-            lost.append(missing)
-        return torch.cat(means), torch.cat(lost)
+        short, run = self.summaries, self.simulator.mean
+        if short is None:
+            return self._run(run, theta, action, key)
+        means, lost = [], []
+        for own, some in product(action.split(1), theta.split(block)):
+            mean, missing = self._run(run, some, own, key)
+            means.append(short(own[0], mean[0]))
+            lost.append(missing[0])
+        shape = len(action), len(theta)
+        return torch.cat(means).unflatten(0, shape), torch.cat(lost).reshape(shape)
 
     def _run(
         self, simulator: Callable[..., Any], theta: Tensor, action: Tensor, key: str
