@@ -18,7 +18,6 @@ from sbi_active.inference.beliefs.diagnostics import Diagnostics
 from sbi_active.inference.declared.diagnosing import Doubt, judged
 from sbi_active.inference.emulation.emulator import (
     EmulatedLikelihood,
-    Interpolation,
 )
 from sbi_active.inference.emulation.pool import TrialRows
 from sbi_active.inference.emulation.regression import Regression, is_misfit
@@ -71,12 +70,6 @@ def shape_of_noise(
             each.append(float(np.abs(skew(values.ravel())) / least))
             each.append(float(np.abs(kurtosis(values.ravel())) / (2 * least)))
     return max(each)
-
-
-def missed_rows(learned: EmulatedLikelihood) -> float:
-    """Return the largest error of a left-out row of processes, in their deviations."""
-    parts = [part for part in learned.parts if isinstance(part, Interpolation)]
-    return max((part.process.left_out_most for part in parts), default=0.0)
 
 
 def predicted_tails(
@@ -232,6 +225,7 @@ def diagnosed(
     fresh: Fresh | None,
     rows: Sequence[TrialRows],
     shape_change: float,
+    off: float,
     rng: np.random.Generator,
     **known: Any,
 ) -> Diagnostics:
@@ -244,6 +238,7 @@ def diagnosed(
         fresh: What fresh simulations say of the last stage.
         rows: Simulations of each trial.
         shape_change: Nats by which noise that is not Gaussian changed the belief.
+        off: Largest error of the last stage's log likelihood at some draws, nats.
         rng: Source of the errors of few simulations.
         known: Further diagnostics.
     """
@@ -261,7 +256,7 @@ def diagnosed(
     figures: dict[str, Any] = {"num_stages": num, "prior_edge_mass": edge_mass}
     details, explained = {}, last.error
     if fresh is None:
-        doubts |= _of_few(last.learned, own)
+        doubts |= _of_few(last.learned, own, off)
     else:
         doubts |= _regressed(stages, own, fresh, shape_change, agreement(last, rows))
         share = [1.0] * (len(tails) - 1)
@@ -286,25 +281,26 @@ def diagnosed(
 
 
 def _of_few(
-    learned: EmulatedLikelihood, own: EmulationSettings, *, most: float = 6.0
+    learned: EmulatedLikelihood, own: EmulationSettings, off: float
 ) -> dict[str, Doubt]:
-    """Return what few rows take for granted, which no fresh ones can check.
+    """Return what few rows take for granted.
 
     Args:
         learned: Learned likelihood.
         own: Settings of the loop.
-        most: Error of a left-out row, in deviations, beyond which a process does not
-            follow the simulator: of some hundred normal errors the largest is 3.
+        off: Largest error of its log likelihood at some draws, nats.
     """
     fits = [part for part in learned.parts if isinstance(part, Regression)]
-    shape, missed = shape_of_noise(fits), missed_rows(learned)
+    shape = shape_of_noise(fits)
     excess = max((fit.excess for fit in fits), default=0.0)
-    return {
+    doubts = {
         "normal_noise": (shape <= 1, shape),
         "even_noise": _evenness(fits),
-        "rows_followed": (missed <= most, missed),
         "no_misfit": (excess <= own.misfit, excess),
     }
+    if len(fits) < len(learned.parts):
+        doubts["likelihood_followed"] = off <= own.off, off
+    return doubts
 
 
 def _evenness(fits: Sequence[Regression]) -> Doubt:

@@ -43,6 +43,7 @@ from sbi_active.inference.emulation.residuals import ShapeSettings
 from sbi_active.inference.emulation.solving import Region, around, whole_space
 from sbi_active.inference.emulation.stages import EmulationSettings, Stage
 from sbi_active.inference.emulation.summaries import Summary
+from sbi_active.inference.emulation.weighing import largest_error
 from sbi_active.inference.engine.importance import fitted
 from sbi_active.inference.engine.learned import (
     LearnedBelief,
@@ -79,6 +80,7 @@ class Emulation:
         stages: The stages so far.
         labels: Label of each trial's summary.
         fresh: What fresh simulations say of the last stage.
+        off: Largest error of its log weights, nats; inf where none was compared.
     """
 
     def __init__(
@@ -107,14 +109,14 @@ class Emulation:
         self._shape_change = 0.0
         len(pool)  # which brings back its rows
         self._at_start = pool.num_drawn
-        # Rows of which fewer are no stage.
-        self._least, self._num_actions = own.fewest, 1
+        self.off = np.inf
+        self._actions = torch.stack([t.action for t in trials]).unique(dim=0)
+        each = int(own.weighed_share * budget / len(self._actions))
+        self._num_weighed = 0 if noise is None else min(own.num_weighed, each)
+        self._least = own.fewest  # rows of which fewer are no stage
         if own.first_share:
-            self._num_actions = len(
-                torch.stack([t.action for t in trials]).unique(dim=0)
-            )
-            each = max(own.fewest, 2 * fewest_rows(coordinates.dim))
-            self._least = each * self._num_actions
+            least = max(own.fewest, 2 * fewest_rows(coordinates.dim))
+            self._least = least * len(self._actions)
 
     def run(self) -> LearnedBelief:
         """Return the belief of the last stage that explains the trials.
@@ -138,15 +140,18 @@ class Emulation:
                     raise
                 break  # beyond what any parameters explain, closer is no better
             stages.append(stage.after(stages[-1]) if stages else stage)
-            if is_last or self._is_settled(stages[-1]):
-                break
             self.near, region = stage.draws, around(stage.draws)
+            if is_last or self._is_settled(stages[-1]):
+                is_confirmed = self._is_confirmed(stages[-1])
+                size = self._size(own.stage_share)
+                if is_last or is_confirmed or size < self._least:
+                    break
         if own.shapes is not None:
             stages[-1] = self._shaped(stages[-1], own.shapes)
         tails = self._tails(stages[-1])
         stages[-1].belief.diagnostics = diagnosed(
             *(stages, own, tails, self.fresh, self._rows()),
-            *(self._shape_change, self.rng),
+            *(self._shape_change, self.off, self.rng),
             num_simulations=self.pool.num_drawn - self._at_start,
             num_missing=self.pool.num_missing,
         )
@@ -158,6 +163,7 @@ class Emulation:
             return 0
         size, left = max(int(share * self.budget), self._least), self.budget
         left -= self.pool.num_drawn - self._at_start
+        left -= self._num_weighed * len(self._actions)
         # A remainder too small for a stage of its own goes to the one before.
         return left if left < size + self._least else size
 
@@ -168,9 +174,34 @@ class Emulation:
         is_known = not is_misfit(stage.learned.excess) and stage.error <= own.small
         return is_known and is_settled
 
+    def _is_confirmed(self, stage: Stage) -> bool:
+        """Return whether simulations have the likelihood that it says.
+
+        Half of them are draws of the belief, half of where it may be as well.
+        """
+        if self._num_weighed == 0:
+            return True
+        half = -(-self._num_weighed // 2)
+        hopeful = replace(stage.learned, is_hopeful=True)
+        other = learned_fit(hopeful, self.rng, near=stage.draws, oversampling=2.0)
+        fits = stage.fit, other
+        z = np.concatenate([fit.draws(half, self.rng) for fit in fits])
+        z = z[: self._num_weighed]
+        theta, t = self.coordinates.to_theta(z), len(self._actions)
+        seed = derive_seed(self.seed, "weighed", len(self.pool.batches))
+        self.pool.simulate(
+            theta.repeat(t, 1),
+            self._actions.repeat_interleave(len(theta), 0),
+            seed=seed,
+            log_proposal=stage.belief.log_prob(theta).repeat(t),
+        )
+        z = self.coordinates.to_z(theta)
+        self.off = largest_error(fits, stage.learned, self._rows(), z)
+        return self.off <= self.own.off
+
     def _sampled(self, learned: EmulatedLikelihood) -> Stage:
         """Return the stage of a likelihood, sampled."""
-        num = self.own.oversampling * self.settings.num_effective
+        num = self.settings.num_effective
         near = self.near if len(self.near) else None
         fit = learned_fit(learned, self.rng, near=near, num_effective=num)
         belief = LearnedBelief(self.prior, fit, defensive=self.settings.defensive)

@@ -66,9 +66,17 @@ class Interpolation:
     def log_likelihood(self, z: Array, caution: float = 1.0) -> Array:
         """Return log densities, (n, d) -> (n,)."""
         mean, variance = self.predict(z)
-        total = np.zeros(len(z))
+        return self.log_density(mean, caution * (self.noise_sd**2 + variance))
+
+    def log_density(self, mean: Array, spread: Array) -> Array:
+        """Return log densities of the observed numbers, shape (n,).
+
+        Args:
+            mean: Means, shape (n, q).
+            spread: Variances where the noise is Gaussian, shape (n, q) or (q,).
+        """
+        total = np.zeros(len(mean))
         if type(self.noise) is GaussianNoise and self.noise.posterior is None:
-            spread = caution * (self.noise_sd**2 + variance)
             for observed in self.observed:
                 square = (observed - mean) ** 2 / spread
                 total -= 0.5 * (square + np.log(2 * np.pi * spread)).sum(1)
@@ -78,6 +86,19 @@ class Interpolation:
             declared = self.noise.log_prob(seen, self._full(mean, 0.0))
             total += declared.double().numpy()
         return total
+
+    def simulated(self, x: Array) -> Array:
+        """Return log densities of noise-free simulations (n, q), shape (n,)."""
+        return self.log_density(x, self.noise_sd**2)
+
+    def hoped(self, z: Array) -> Array:
+        """Return log densities of what is nearest to the observed numbers, (n,).
+
+        Within as many deviations as the process misses a left-out row by.
+        """
+        mean, variance = self.predict(z)
+        off = self.process.left_out_most * np.sqrt(variance)
+        return self.simulated(np.clip(self.observed.mean(0), mean - off, mean + off))
 
     def predict(self, z: Array) -> tuple[Array, Array]:
         """Return mean and variance without noise, both (n, q)."""
@@ -157,6 +178,8 @@ class EmulatedLikelihood:
             simulations do not all agree, by trial.
         is_cautious: Whether misfit widens the noise, to find where to simulate next and
             not what to believe.
+        is_hopeful: Whether interpolations are as near to what was observed as they may
+            be, to find where else the belief may be.
     """
 
     coordinates: PriorCoordinates
@@ -165,6 +188,7 @@ class EmulatedLikelihood:
     groups: tuple[tuple[int, ...], ...] = ()
     outcomes: dict[int, TrialOutcome] = field(default_factory=dict)
     is_cautious: bool = False
+    is_hopeful: bool = False
 
     @property
     def excess(self) -> float:
@@ -177,6 +201,9 @@ class EmulatedLikelihood:
         z = z[inside]
         own = np.zeros(len(z))
         for part in self.parts:
+            if self.is_hopeful and isinstance(part, Interpolation):
+                own += part.hoped(z)
+                continue
             own += part.log_likelihood(z, part.caution() if self.is_cautious else 1.0)
         for outcome in self.outcomes.values():
             own += outcome.log_prob(z)

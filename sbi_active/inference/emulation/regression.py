@@ -25,7 +25,12 @@ from numpy.typing import NDArray
 from scipy.stats import chi2, f
 
 from sbi_active.arrays import Array
-from sbi_active.inference.emulation.residuals import NoiseShape, ShapeSettings, alike
+from sbi_active.inference.emulation.residuals import (
+    Growth,
+    NoiseShape,
+    ShapeSettings,
+    alike,
+)
 from sbi_active.inference.emulation.solving import Basis, Region, best_solved, bulk
 from sbi_active.inference.sampling.mixtures import log_student
 
@@ -82,7 +87,8 @@ class Regression:
         largest: Largest sum of their squares, whitened.
         shape: Another density of the noise, not Gaussian; None where that is none.
         uneven: Change of the log variance of the residuals by a deviation of a
-            coordinate, in units of what moves a belief, or of chance.
+            coordinate, or with what they are on, in units of what moves a belief, or of
+            chance.
     """
 
     basis: Basis
@@ -147,12 +153,17 @@ class Regression:
         if np.isfinite(noise).all():
             share = (polynomial.square - noise) / np.maximum(x.var(0), noise)
             roughness = float(share.max(initial=0.0))
-        shape, even = None, own.residual
+        shape, even, grows = None, own.residual, 0.0
         rows = region.distance(z) <= own.basis.reach
+        f = own.basis(z[rows])
+        rest = x[rows] - f @ own.coefficient
+        varies = rest.std(0) > 0
         if shapes is not None:
-            f = own.basis(z[rows])
-            rest = x[rows] - f @ own.coefficient
             shape = NoiseShape.fit(f, own.coefficient, rest, observed, trial, shapes)
+        elif varies.any():
+            mean = (f @ own.coefficient + observed)[:, varies]
+            growth = Growth.fit(mean, rest[:, varies], ShapeSettings())
+            grows = growth.uneven(mean.size)
         if shape is not None:  # which knows of noise that grows with what it is on
             mean = f @ shape.coefficient
             size = ((mean + observed) ** 2 + shape.floor**2) ** (0.5 * shape.power)
@@ -185,7 +196,7 @@ class Regression:
             standardized=standardized,
             largest=float((white**2).sum(1).max() / chi2.ppf(0.9, white.shape[1])),
             shape=shape,
-            uneven=_uneven(z[rows][own.near], even[own.near]),
+            uneven=max(grows, _uneven(z[rows][own.near], even[own.near])),
         )
 
     def residual(self, z: Array, place: int) -> tuple[Array, Array]:

@@ -158,6 +158,56 @@ class ShapeSettings:
 
 
 @dataclass(frozen=True)
+class Growth:
+    r"""How the size of residuals grows with what they are on.
+
+    Attributes:
+        power: :math:`\beta`.
+        floor: f, shape (q,).
+        gain: Nats a number by which residuals are likelier than of one size.
+        change: Deviation of the log variance over the simulations.
+    """
+
+    power: float
+    floor: Array
+    gain: float
+    change: float
+
+    @staticmethod
+    def fit(mean: Array, residual: Array, own: ShapeSettings) -> Growth:
+        """Return the growth of residuals on means, both (n, q), none constant.
+
+        Args:
+            mean: Predicted outcomes.
+            residual: Outcomes less predictions.
+            own: Settings.
+        """
+        floor = own.floor * np.sqrt((mean**2).mean(0)) + 1e-30
+        log_mean = 0.5 * np.log(mean**2 + floor**2)
+
+        def loss(power: float) -> float:
+            """Return minus the Gaussian log likelihood but for a constant."""
+            log_size = power * log_mean
+            deviation = (residual / np.exp(log_size)).std(0)
+            return float((np.log(deviation) + log_size.mean(0)).mean())
+
+        found: Any = minimize_scalar(loss, bounds=own.powers, method="bounded")
+        power = float(found.x)
+        change = 2 * abs(power) * float(log_mean.std(0).mean())
+        return Growth(power, floor, loss(0.0) - float(found.fun), change)
+
+    def uneven(self, num: int, *, sure: float = 6.0, matters: float = 0.5) -> float:
+        """Return how much it changes, above 1 where that matters and is no chance.
+
+        Args:
+            num: Number of residuals.
+            sure: Nats of all of these that are no chance: 3.5 standard errors.
+            matters: Deviation of the log variance that moves a belief.
+        """
+        return min(self.gain * num / sure, self.change / matters)
+
+
+@dataclass(frozen=True)
 class NoiseShape:
     r"""A density of residuals beside the Gaussian.
 
@@ -206,17 +256,10 @@ class NoiseShape:
         varies = residual.std(0) > 0
         if not varies.all() or q == 0:
             return None
-        floor = own.floor * np.sqrt((mean**2).mean(0)) + 1e-30
-
-        def loss(power: float) -> float:
-            """Return minus the Gaussian log likelihood but for a constant."""
-            log_size = 0.5 * power * np.log(mean**2 + floor**2)
-            deviation = (residual / np.exp(log_size)).std(0)
-            return float((np.log(deviation) + log_size.mean(0)).mean())
-
-        found: Any = minimize_scalar(loss, bounds=own.powers, method="bounded")
-        power = float(found.x) if loss(0.0) - found.fun > own.gain else 0.0
-        gain = loss(0.0) - loss(power)
+        growth = Growth.fit(mean, residual, own)
+        floor, power, gain = growth.floor, 0.0, 0.0
+        if growth.gain > own.gain:
+            power, gain = growth.power, growth.gain
         if power:  # least squares that weigh by the noise
             weight = (mean**2 + floor**2) ** -power
             normal = np.einsum("np,nj,nr->jpr", features, weight, features)

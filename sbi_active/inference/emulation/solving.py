@@ -266,7 +266,10 @@ def best_solved(
         """Return the score, and what is asked of a higher degree."""
         return fit.score + gain * x.shape[1] * fit.basis.degree
 
-    best = polynomial = min(fits, key=cost)
+    # Where rows are few a constant predicts best, and would say that a trial tells
+    # nothing; slopes that are not known have an error, which is known.
+    sloped = [fit for fit in fits if fit.basis.degree]
+    best = polynomial = min(sloped or fits, key=cost)
     if not (best.square > rough * noise).any():
         return best, best
     rng = np.random.default_rng(7)  # any fixed directions will do

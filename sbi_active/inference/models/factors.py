@@ -16,7 +16,6 @@ from typing_extensions import override
 from sbi_active.arrays import Array
 from sbi_active.inference.beliefs.diagnostics import Diagnostics
 from sbi_active.inference.declared.settings import RefinementOptions
-from sbi_active.inference.emulation.stages import EmulationSettings
 from sbi_active.inference.engine.learned import LearnedBelief, learned_fit
 from sbi_active.inference.rounds.condition import action_rows, outcome_rows, pack
 from sbi_active.inference.rounds.rows import Observation
@@ -235,10 +234,9 @@ def sample_product(
         enough: Effective draws below which the normalizer is off by more than a tenth
             of a nat.
     """
-    prior, num = product.coordinates.prior, settings.num_effective
+    prior = product.coordinates.prior
     near = None if hint is None else product.coordinates.to_z(hint)
-    num *= EmulationSettings().oversampling
-    fit = learned_fit(product, rng, near=near, num_effective=num)
+    fit = learned_fit(product, rng, near=near, num_effective=settings.num_effective)
     belief = LearnedBelief(prior, fit, defensive=settings.defensive)
     belief.label = "product over trials"
     effective = fit.effective_sample_size

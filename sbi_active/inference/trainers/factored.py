@@ -97,7 +97,19 @@ class ProductRounds(ActionRounds):
         num_kernels: int = 2_000,
         num_hints: int = 1_000,
     ) -> Belief | None:
-        """Return the product under this round's network, where it is required."""
+        """Return the product under this round's network, where it is required.
+
+        Args:
+            trials: The history.
+            settings: Settings of the belief.
+            seed: Seed of all draws.
+            required: Whether there must be a belief.
+            num_kernels: Number of draws behind a kernel density estimate: the kernels
+                of two parameters are .28 of a deviation wide, of half of them .32 and
+                of twice as many .25.
+            num_hints: Number of training rows that say where to look first: of these a
+                mode of a hundredth of the mass has ten, of half as many five.
+        """
         if not required:
             return None
         require_whole(torch.stack([trial.x for trial in trials]))
