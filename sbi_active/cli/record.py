@@ -179,8 +179,7 @@ def trial_of(campaign: Any, trial: Any) -> dict[str, Any]:
     found = scored(trial)
     found = {"trial": found.pop("index"), **found}
     for name in ("action", "x"):
-        if found[name] is not None:
-            found[name] = flat(found[name])
+        found[name] = None if found[name] is None else flat(found[name])
     actions = campaign.actions
     return {**found, "names": [*actions.names], "units": [*actions.units]}
 
