@@ -81,7 +81,7 @@ class ImportanceSampling:
         num_tempered: Number of those to a power of it.
         ridge: Places along ridges, of the last proposal there.
         is_along: Whether the last proposal was along ridges; None before any.
-        best: Largest share of a proposal's draws that were effective.
+        best: Largest share of a proposal's draws that were effective, by enough draws.
         efficiency: Share of the draws that were effective of the last proposal along
             ridges, and of the last other one.
     """
@@ -116,9 +116,7 @@ class ImportanceSampling:
         """Draw until enough are effective, or the budget is spent."""
         pool, potential, own = self.pool, self.potential, self.settings
         budget, start = own.budget(potential.dim), potential.num_simulations
-        proposal, latched, heavy, least = pool.final, 0.0, 0, 0.0
-        kept: Proposal | None = None  # the best
-        most = pool.rest
+        proposal, heavy, least = pool.final, 0, 0.0
         for _ in range(own.max_rounds):
             left = budget - (potential.num_simulations - start)
             power = _largest_power(*self._logs(), own.fewest)
@@ -128,7 +126,7 @@ class ImportanceSampling:
             wanted = own.asked(effective, divergence, is_cheap=is_cheap)
             wanted = max(wanted, least)
             if not len(pool.u) or left <= 0:
-                break
+                return
             is_heavy = False
             if power == 1 and effective >= wanted:
                 shape = pareto_shape(pool.log_weight[pool.is_final])
@@ -137,16 +135,14 @@ class ImportanceSampling:
                     return
                 heavy += 1  # draws that outweigh others show where to draw more
                 least = effective
-            elif effective > most.effective:
-                most = pool.rest
             efficiency = max(effective, 1e-9) / max(pool.num_final, 1)
             is_known = proposal is not None and effective >= own.seen
             missing = (wanted - effective) / efficiency  # draws
             is_good = power == 1 and efficiency >= own.efficient
             is_good |= is_known and own.affords(missing, potential.dim)
             # It no longer gets better by being fitted again.
-            is_good |= self.num_full >= own.max_fits and efficiency >= 0.5 * self.best
-            is_good |= efficiency >= 0.5 * latched > 0  # what was drawn is not lost
+            is_last = self.num_full >= own.max_fits
+            is_good |= is_last and efficiency >= 0.5 * self.best > 0
             few = min(wanted, own.few_for_fit(potential.dim))
             to_fit = (few - effective) / efficiency
             draws_on = is_known and power == 1 and to_fit > 0  # it would be a poor fit
@@ -155,42 +151,19 @@ class ImportanceSampling:
             if proposal is not None and (is_good or draws_on) and not is_heavy:
                 rows = (own.num_effective - effective) / efficiency * pool.num_trials
                 if pool.num_past and rows > left:
-                    break  # modes serve better than draws of fewer trials
-                latched = latched or is_good * efficiency
+                    return  # modes serve better than draws of fewer trials
                 size = 1.1 * (missing if is_good else to_fit)
                 size = int(np.clip(size, 0.2 * own.num_draws, 4 * own.num_draws))
-            elif kept is not None and self._returns(efficiency, wanted, left):
-                pool.restart()  # what was fitted since is worse
-                proposal, latched, kept = kept, self.best, None
             else:
-                if efficiency > self.best and effective >= own.seen:
-                    kept = proposal
-                if pool.num_past and kept is None and self.num_full > own.max_fits:
-                    break  # modes are found again, and particles led from there
-                self.best, latched = max(self.best, efficiency), 0.0
+                if effective >= own.seen:
+                    self.best = max(self.best, efficiency)
+                if pool.num_past and not self.best and self.num_full > own.max_fits:
+                    return  # modes are found again, and particles led from there
                 pool.restart()
                 proposal = self._fitted(power, efficiency)
             best = float((pool.log_prior + pool.log_likelihood).max())
             floor = best - own.negligible / power
             pool.add(proposal, proposal.sample(size, self.rng), potential, floor)
-        if most.effective > (last := pool.rest).effective:
-            pool.rest_on(most)
-            if pool.missed > own.most_missed:  # what was drawn since has refuted it
-                pool.rest_on(last)
-
-    def _returns(self, efficiency: float, wanted: float, left: float) -> bool:
-        """Return whether the best proposal goes on in place of another fit.
-
-        Args:
-            efficiency: Share of the last proposal's draws that were effective.
-            wanted: Effective draws to end with.
-            left: Rows that are left to spend.
-        """
-        own, num = self.settings, wanted / self.best
-        is_affordable = own.affords(num / own.max_fits, self.potential.dim)
-        is_affordable &= num * self.pool.num_trials <= left
-        is_lost = efficiency < own.lost * self.best
-        return self.num_full >= own.max_fits or (is_lost and is_affordable)
 
     def _fitted(self, power: float, efficiency: float) -> Proposal:
         """Return a proposal for a power of the likelihood, fitted to all draws.

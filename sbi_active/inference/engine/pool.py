@@ -36,23 +36,6 @@ class PriorDraws(Proposal):
         return self.potential.log_prior(z)
 
 
-@dataclass(frozen=True)
-class Rest:
-    """Draws that a posterior rests on.
-
-    Attributes:
-        effective: Number of effective draws.
-        is_final: Mask of the draws at that time, shape (n,).
-        num_final: Draws of their proposal, also those that do not count.
-        final: Their proposal.
-    """
-
-    effective: float
-    is_final: NDArray[np.bool_]
-    num_final: int
-    final: Proposal | None
-
-
 @dataclass
 class Pool:
     """Draws of all proposals so far that may still count.
@@ -159,19 +142,8 @@ class Pool:
 
     def restart(self) -> None:
         """Rest the posterior on draws to come."""
-        self.rest_on(Rest(0.0, np.zeros_like(self.is_final), 0, None))
-
-    @property
-    def rest(self) -> Rest:
-        """What the posterior rests on."""
-        effective = self.effective_sample_size
-        return Rest(effective, self.is_final, self.num_final, self.final)
-
-    def rest_on(self, rest: Rest) -> None:
-        """Rest the posterior on draws that it rested on before."""
-        later = np.zeros(len(self.u) - len(rest.is_final), dtype=bool)
-        self.is_final = np.concatenate([rest.is_final, later])
-        self.num_final, self.final = rest.num_final, rest.final
+        self.is_final, self.num_final = np.zeros_like(self.is_final), 0
+        self.final = None
 
     def add(
         self,

@@ -96,10 +96,6 @@ class Settings:
             3) / 2 numbers of a normal density, if they are affordable. Without it, fits
             of ten parameters lose nine tenths of the efficiency before; half of it and
             twice change their rows by a fifth either way.
-        lost: Share of the best efficiency below which a proposal is given up for the
-            best one, if that takes no more draws than ``max_fits`` times those that are
-            affordable. A choice: fits that collapse lose nine tenths, and half of it
-            and twice gave the same draws of ten parameters.
         max_fits: Fits to the whole likelihood at most, unless the last is half as
             efficient as the best.
         wider: Factor of the draws' widths in a proposal of one parameter; less of more.
@@ -165,7 +161,6 @@ class Settings:
     seen: float = 8.0
     affordable: float = 3.0
     per_number: float = 4.0
-    lost: float = 0.25
     max_fits: int = 4
     wider: float = 1.4
     jitter: float = 0.1
