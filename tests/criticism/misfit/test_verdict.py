@@ -171,3 +171,19 @@ def test_a_set_with_an_effect_on_the_noise_has_draws_for_the_next_action():
     assert tracing.evidences[both].draws.shape[1] == 3
     actions = DiscreteActions(torch.linspace(-2, 2, 5))
     assert loop.next_action(actions).candidates.shape == (5, 1)
+
+
+def test_left_out_trials_of_a_few_that_scatter_have_errors_as_large():
+    """Without one of seven trials the others may not show that they scatter."""
+    action, covered = torch.linspace(-1, 1, 7, dtype=torch.float64)[:, None], []
+    model = SimulatorModel(lambda theta, a: theta * a, noise=GaussianNoise(0.1))
+    prior = BoxUniform(-5 * torch.ones(1), 5 * torch.ones(1))
+    for seed in range(8):
+        gen = torch.Generator().manual_seed(seed)
+        error = 0.3 * torch.randn(7, 1, generator=gen, dtype=torch.float64)
+        loop = Criticism(model, prior, Trials(action, 2 * action + error), seed=seed)
+        if loop.trace().verdict == "scatter":
+            covered.append(loop.evaluate().after["coverage"].mean())
+    assert len(covered) >= 4
+    # Of 28 trials or more, with three standard errors; it was below .75.
+    assert np.mean(covered) >= 0.76
