@@ -143,17 +143,13 @@ class ImportanceSampling:
             # It no longer gets better by being fitted again.
             is_last = self.num_full >= own.max_fits
             is_good |= is_last and efficiency >= 0.5 * self.best > 0
-            few = min(wanted, own.few_for_fit(potential.dim))
-            to_fit = (few - effective) / efficiency
-            draws_on = is_known and power == 1 and to_fit > 0  # it would be a poor fit
-            draws_on &= own.affords(to_fit, potential.dim)
             size = own.draws_of_fit(potential.dim)
-            if proposal is not None and (is_good or draws_on) and not is_heavy:
+            if proposal is not None and is_good and not is_heavy:
                 rows = (own.num_effective - effective) / efficiency * pool.num_trials
                 if pool.num_past and rows > left:
                     return  # modes serve better than draws of fewer trials
-                size = 1.1 * (missing if is_good else to_fit)
-                size = int(np.clip(size, 0.2 * own.num_draws, 4 * own.num_draws))
+                least_size, most_size = 0.2 * own.num_draws, 4 * own.num_draws
+                size = int(np.clip(1.1 * missing, least_size, most_size))
             else:
                 if effective >= own.seen:
                     self.best = max(self.best, efficiency)

@@ -92,10 +92,6 @@ class Settings:
         seen: Effective draws from which a proposal's efficiency is believed.
         affordable: Draws that are not worth another fit, in draws of a fit. With eight,
             modes of ten parameters are drawn from to the end, and tails are missed.
-        per_number: Effective draws that a proposal is fitted to, for each of the d (d +
-            3) / 2 numbers of a normal density, if they are affordable. Without it, fits
-            of ten parameters lose nine tenths of the efficiency before; half of it and
-            twice change their rows by a fifth either way.
         max_fits: Fits to the whole likelihood at most, unless the last is half as
             efficient as the best.
         wider: Factor of the draws' widths in a proposal of one parameter; less of more.
@@ -160,7 +156,6 @@ class Settings:
     efficient: float = 0.3
     seen: float = 8.0
     affordable: float = 3.0
-    per_number: float = 4.0
     max_fits: int = 4
     wider: float = 1.4
     jitter: float = 0.1
@@ -203,10 +198,6 @@ class Settings:
     def affords(self, num: float, dim: int) -> bool:
         """Return whether so many draws are not worth another fit."""
         return num <= self.affordable * self.draws_of_fit(dim)
-
-    def few_for_fit(self, dim: int) -> float:
-        """Return the effective draws below which a fit to them is poor."""
-        return self.per_number * dim * (dim + 3) / 2
 
     def num_fitted(self, dim: int) -> int:
         """Return the repeated draws that a proposal is fitted to."""
