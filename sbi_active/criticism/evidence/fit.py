@@ -104,7 +104,8 @@ class Fit:
         own, some = self.sample, replace(self, known=known)
         residual, log_scale, _ = self.rival.residual(own.u, penalized=False)
         lost = np.broadcast_to(log_scale, residual.shape)[:, ~known].sum(1)
-        log_w = np.log(np.maximum(own.weight, 1e-300)) + lost
+        with np.errstate(divide="ignore"):  # what counts for nothing stays out
+            log_w = np.log(own.weight) + lost
         log_w += some.error.log_likelihood(residual[:, known])
         log_w -= self.error.log_likelihood(residual)
         log_w = np.where(np.isfinite(log_w), log_w, -np.inf)
