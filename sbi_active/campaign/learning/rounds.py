@@ -79,6 +79,7 @@ class Round:
                 learner.inference.append_simulations(
                     rows.theta, rows.x, action=rows.action, belief=learner.belief
                 )
+                del rows  # of which training has its own
             own = forked_generators(state.seed, "train", len(state.explained))
             with state.stage(index, "training"), own:
                 learner.inference.train()

@@ -128,7 +128,8 @@ class MixtureDensityNetwork(ConditionalDensityEstimator):
         self.conditioning = conditioning
         self._num_components, self._dim = num, dim
         self._masked_columns, self._ever_missing = masked, ever_missing.cpu()
-        self._largest_gap = int(missing.sum(1).max())
+        # NumPy sums a mask without a copy of eight times its size.
+        self._largest_gap = int(missing.cpu().numpy().sum(1).max())
         self._sections = [num, num * dim, num * dim, num * num_upper]
         # The local frames take turns; the last component has the global frame.
         num_frames = conditioning.num_frames
