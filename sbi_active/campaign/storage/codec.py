@@ -60,12 +60,12 @@ def made(name: str, state: Mapping[str, Any]) -> Any:
     """
     kind = _class(name)
     instance = object.__new__(kind)
+    own, options = instance.__dict__, getattr(kind, "__attrs_attrs__", ())
     for entry in getattr(kind, "__dataclass_fields__", {}).values():
         if entry.default_factory is not dataclasses.MISSING:
-            instance.__dict__[entry.name] = entry.default_factory()
-    for entry in getattr(kind, "__attrs_attrs__", ()):  # options: all have one
-        instance.__dict__[entry.name] = entry.default
-    instance.__dict__.update(state)
+            own[entry.name] = entry.default_factory()
+    # All options have a default.
+    own.update({entry.name: entry.default for entry in options}, **state)
     return instance
 
 
@@ -90,10 +90,8 @@ def numbers(tensor: Tensor) -> Any:
 #: What a file may have called, besides what torch makes tensors by.
 CALLED = made, given, few, numbers, Message, set, frozenset
 PLAIN = set, frozenset, OrderedDict, torch.Size, torch.dtype, torch.nn.Parameter
-NAMED = {
-    *(*CALLED, *PLAIN, *torch._storage_classes),
-    *(_utils._rebuild_tensor_v2, _utils._rebuild_parameter),
-}
+NAMED = {*CALLED, *PLAIN, *torch._storage_classes}
+NAMED |= {_utils._rebuild_tensor_v2, _utils._rebuild_parameter}
 
 
 def encode(value: Any, *, known: Mapping[str, Any]) -> bytes:

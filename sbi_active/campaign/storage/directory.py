@@ -11,7 +11,7 @@ from __future__ import annotations
 import functools
 import json
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import AbstractContextManager, suppress
+from contextlib import AbstractContextManager, closing, nullcontext, suppress
 from importlib.metadata import version
 from pathlib import Path
 from types import SimpleNamespace
@@ -157,7 +157,8 @@ class Storage:
             LockedError: If another process has it.
             LogChangedError: If another process wrote since the campaign was loaded.
         """
-        return self.store.writing(LOG, len(self.events))
+        store, num = self.store, len(self.events)
+        return nullcontext() if store is None else store.writing(LOG, num)
 
 
 def make_campaign(
@@ -183,10 +184,9 @@ def make_campaign(
     expected, got = "an empty folder for a new campaign", f"{folder} with one"
     advice = "go on by Campaign.load(directory, simulator=...) or choose another folder"
     require(not store.catalog, expected, got, advice)
-    with store.writing():
+    with closing(store), store.writing():
         for kind, content in {MANIFEST: manifest, **objects}.items():
             store.put(kind, content)
-    store.close()
     lines = [f"# What this campaign is, for people. {NAME} has all; this is not read."]
     for key, value in manifest.items():  # a text of JSON is one of TOML
         if isinstance(value, str | int | list):
@@ -331,10 +331,8 @@ def stored(method: Method) -> Method:
         version = campaign.state.version.number
         advice = "pass it: Campaign.load(directory, simulator=...)"
         require(own is not None, "the simulator, which no folder has", "none", advice)
-        if storage.store is not None:
-            with storage.writing():  # before anything is computed
-                pass
-
+        with storage.writing():  # before anything is computed
+            pass
         find = functools.partial(storage.find_bank, own=own, version=version)
         with metering(campaign.state.meter, find):
             return apart(campaign, *arguments, **options)

@@ -9,6 +9,7 @@ from __future__ import annotations
 import copy
 import json
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
@@ -31,7 +32,7 @@ SEGMENT_BYTES = 4 * 2**20
 SHAPED = "theta", "action", "x"
 
 
-class Bank:
+class Bank(AbstractContextManager["Bank"]):
     r"""Simulated rows on disk, to go on with, read in parts, and reuse.
 
     A row is theta, action, x, its outcome, the seed of its run, its index there, and
@@ -91,9 +92,6 @@ class Bank:
         if simulator is not None:
             self._mine = {**fingerprint(simulator, version=version), "shapes": None}
         _ = self.header
-
-    def __enter__(self) -> Bank:
-        return self
 
     def __exit__(self, *_: object) -> None:
         self.close()

@@ -205,8 +205,8 @@ class Store:
             if self._lock is not None:
                 return
             lock = _connected(self.folder / LOCK, "rwc", timeout=0.1)
-            lock.execute("PRAGMA journal_mode = MEMORY")  # nothing is written
-            lock.execute("BEGIN EXCLUSIVE")
+            # Nothing is written.
+            lock.executescript("PRAGMA journal_mode = MEMORY; BEGIN EXCLUSIVE")
             self._lock = lock
 
     def close(self) -> None:
@@ -371,9 +371,8 @@ def _insert(at: Any, name: int, kind: str, number: int, content: Any) -> None:
 
 def _digest(name: int, kind: str, number: int, content: bytes) -> bytes:
     """Return the checksum of a record, in a store of a name."""
-    digest = hashlib.sha256(f"{name} {kind} {number} ".encode())
-    digest.update(content)
-    return digest.digest()
+    head = f"{name} {kind} {number} ".encode()
+    return hashlib.sha256(head + content).digest()
 
 
 def _before_fork() -> None:
