@@ -79,6 +79,6 @@ def test_the_closed_loop_tells_of_its_stages(caplog, capsys):
     loop(show_progress=True)
     shown, said = capsys.readouterr().err, "\n".join(lines(caplog))
     for told in (shown, said):
-        assert "models fitted" in told
+        assert "verdict, sets of effects fitted" in told
         assert "error before and after, a verdict without each trial" in told
         assert "/6 [" in told
