@@ -35,24 +35,29 @@ LogLikelihood = Callable[..., Any]
 
 
 def kernels(
-    cloud: Array,
+    z: Array,
+    share: Array,
     rng: np.random.Generator,
     *,
     num: int = 150,
+    each: int = 4,
     neighbors: float = 0.2,
     width: float = 0.5,
 ) -> StudentMixture:
-    """Return t kernels about draws (n, d), each shaped as those nearest to it lie.
+    """Return t kernels about weighted draws, each shaped as those nearest to it lie.
 
     Args:
-        cloud: Draws of equal weight, some of them repeated.
+        z: Draws, shape (n, d).
+        share: Their weights, shape (n,), summing to 1.
         rng: Source of the places.
         num: Number of kernels.
+        each: Repeated draws behind a kernel, on average.
         neighbors: Share of the draws that shape a kernel, so that the mixture follows a
             bent posterior.
         width: Width of a kernel in deviations of its neighbors; its place is as far
             from a draw. On a draw it would make that look more probable than new ones.
     """
+    cloud = z[systematic(share, each * num, 0.5)]
     overall = np.atleast_2d(np.cov(cloud.T)) + 1e-6 * np.eye(cloud.shape[1])
     white = np.linalg.solve(np.linalg.cholesky(overall), cloud.T).T
     chosen = rng.choice(len(cloud), num)
@@ -90,12 +95,16 @@ class SampledPosterior:
         seed: Seed of the draws.
         fewest: Effective draws below which the likelihood is tempered.
         negligible: Nats below the heaviest draw from where one may be given up.
+        prior_share: Share of the prior in each proposal, so that no weight is without
+            a bound.
 
     Attributes:
         theta: Draws, shape (n, d), float64.
         weight: Their weights, shape (n,), summing to 1.
         log_evidence: :math:`\log Z` in nats.
-        log_evidence_se: Its standard error, and that of every log density.
+        log_evidence_se: Its standard error, and that of every log density. As draws
+            shape the proposals, log Z is too small as well: by .01 nats without trials
+            of the oscillator, and up to .02 with them, at 12,000 effective draws.
         effective_sample_size: :math:`(\sum_i w_i)^2 / \sum_i w_i^2`.
 
     Raises:
@@ -116,6 +125,7 @@ class SampledPosterior:
         seed: int = 0,
         fewest: int = 150,
         negligible: float = 16.0,
+        prior_share: float = 0.05,
     ) -> None:
         self.prior, self._log_likelihood = prior, log_likelihood
         rng = np.random.default_rng(seed)
@@ -147,8 +157,8 @@ class SampledPosterior:
 
             power = largest_power(suffices)
             best = log_weight.max() if power == 1 else -np.inf
-            cloud = z[systematic(normalized(log_ratio + power * log_l), 600, 0.5)]
-            proposal = Defended(kernels(cloud, rng), base, 0.05)
+            around = kernels(z, normalized(log_ratio + power * log_l), rng)
+            proposal = Defended(around, base, prior_share)
         if not effective:
             raise ValueError(
                 "expected a draw that explains every trial; got none of "

@@ -217,10 +217,7 @@ class InformationGainDesigner(Shown):
                     *(finalists, budget),
                     num_samples=self.num_samples,
                     share=0.5 if self.eliminate else 1.0,
-                    # Of a search some are left that differ by less than they err:
-                    # with .05 as of a list it lost six times as much, .001 saves
-                    # nothing more.
-                    negligible=0.003 if listed is None else 0.05,
+                    negligible=self.search.negligible if listed is None else 0.05,
                     notes=notes,
                 )
             )

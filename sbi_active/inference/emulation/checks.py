@@ -16,9 +16,7 @@ from scipy.stats import binom, chi2, kurtosis, skew
 from sbi_active.arrays import Array
 from sbi_active.inference.beliefs.diagnostics import Diagnostics
 from sbi_active.inference.declared.diagnosing import Doubt, judged
-from sbi_active.inference.emulation.emulator import (
-    EmulatedLikelihood,
-)
+from sbi_active.inference.emulation.emulator import EmulatedLikelihood
 from sbi_active.inference.emulation.pool import TrialRows
 from sbi_active.inference.emulation.regression import Regression, is_misfit
 from sbi_active.inference.emulation.stages import EmulationSettings, Stage

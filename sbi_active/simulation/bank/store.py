@@ -371,8 +371,9 @@ def _insert(at: Any, name: int, kind: str, number: int, content: Any) -> None:
 
 def _digest(name: int, kind: str, number: int, content: bytes) -> bytes:
     """Return the checksum of a record, in a store of a name."""
-    head = f"{name} {kind} {number} ".encode()
-    return hashlib.sha256(head + content).digest()
+    digest = hashlib.sha256(f"{name} {kind} {number} ".encode())
+    digest.update(content)
+    return digest.digest()
 
 
 def _before_fork() -> None:
