@@ -12,7 +12,7 @@ from torch import Tensor
 from torch.distributions import Distribution
 
 from sbi_active.actions import ActionSpace
-from sbi_active.arrays import measured
+from sbi_active.arrays import all_finite, measured
 from sbi_active.campaign.display.figures import plot_campaign
 from sbi_active.campaign.display.page import campaign_html, to_dataframe
 from sbi_active.campaign.health import assess, doubts, in_doubt
@@ -31,8 +31,6 @@ if TYPE_CHECKING:
     from pandas import DataFrame
 
     from sbi_active.criticism import Effect
-
-LARGEST = torch.finfo(torch.float32).max
 
 
 class CampaignTrials(Telling[Trial]):
@@ -318,13 +316,13 @@ def outcome_told(x: Any, x_shape: torch.Size) -> Tensor:
 
 def _action_told(action: Any, action_dim: int) -> Tensor:
     numbers = _numbers(action, "the action")
-    finite = numbers.isfinite() & (numbers.abs() <= LARGEST)
-    if not bool(finite.all()):
+    executed = action_rows(numbers, action_dim, num_rows=1)[0]
+    if not all_finite(executed):
         raise ValueError(
             f"expected a finite action of real numbers; got {numbers.tolist()}; pass "
             "the action that was executed, or status='missing' where it is unknown"
         )
-    return action_rows(numbers, action_dim, num_rows=1)[0]
+    return executed
 
 
 def _numbers(told: Any, name: str) -> Tensor:

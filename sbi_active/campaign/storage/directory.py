@@ -109,10 +109,10 @@ class Storage:
             **entries: JSON data.
         """
         if self.store is not None:
-            line = json.dumps(telling.event_of(event, trial, **entries))
+            line = telling.event_of(event, trial, **entries)
             with self.writing():
-                self.store.append(LOG, line.encode())
-            self.events.append(json.loads(line))
+                self.store.append(LOG, json.dumps(line).encode())
+            self.events.append(line)
 
     def save(self, state: CampaignState, learner: Any) -> None:
         """Write what follows from the log so far.

@@ -178,16 +178,15 @@ class Store:
         with GUARD:
             self.acquire()
             with self.reading() as connection:
-                is_left = self.seal() == self._left
-                whole(self.path, is_left, "another file; nothing was written to it now")
+                same = self.seal() == self._left
+                whole(self.path, same, "another file; nothing was written to it now")
                 connection.execute("BEGIN IMMEDIATE")
                 try:
-                    if series and self.catalog.get(series, 0) != length:
+                    self._listed = self.catalog
+                    if series and self._listed.get(series, 0) != length:
                         self._drop("_lock")  # others may go on
-                        raise LogChangedError(
-                            f"expected {self.folder} as it was loaded; got trials that "
-                            "another process told since; load it again, and tell anew"
-                        )
+                        told = f"expected {self.folder} as it was loaded; got trials of"
+                        raise LogChangedError(f"{told} another process; load it again")
                     yield
                     connection.commit()
                 finally:
@@ -240,8 +239,8 @@ class Store:
 
     def seal(self, *ends: str) -> str:
         """Return a text that changes if the file does, or those of other endings."""
-        files = [self.path.with_name(f"{NAME}{end}") for end in ("", *ends)]
-        states = [os.stat(file) for file in files if file.exists()]
+        files = [f"{self.path}{end}" for end in ("", *ends)]
+        states = [os.stat(file) for file in files if os.path.exists(file)]
         return str([(s.st_ino, s.st_size, s.st_mtime_ns) for s in states])
 
     def put(self, kind: str, content: Any, number: int = 0) -> None:
@@ -252,14 +251,14 @@ class Store:
             content: Bytes, or JSON data.
             number: Number of the record; 0 of one that is no series.
         """
-        catalog = self.catalog
-        if number > catalog.get(kind, -1):
-            _insert(self._connection, self._id, CATALOG, 0, {**catalog, kind: number})
+        if number > self._listed.get(kind, -1):
+            self._listed[kind] = number
+            _insert(self._connection, self._id, CATALOG, 0, self._listed)
         _insert(self._connection, self._id, kind, number, content)
 
     def append(self, series: str, content: Any) -> None:
         """Write the next record of a series, in :meth:`writing`."""
-        self.put(series, content, self.catalog.get(series, 0) + 1)
+        self.put(series, content, self._listed.get(series, 0) + 1)
 
     def verify(self) -> None:
         """Read every byte of the file.

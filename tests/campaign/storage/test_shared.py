@@ -63,7 +63,7 @@ def test_two_writers_without_locks_refuse_before_they_write(tmp_path, monkeypatc
         connected = store._connected
         patch.setattr(store, "_connected", unlocked)
         b.attach([1.0], number(2))
-    with pytest.raises(LogChangedError, match="another process told since"):
+    with pytest.raises(LogChangedError, match="trials of another process"):
         a.attach([2.0], number(3))
     assert told(folder) == [number(1), number(2)]
 
