@@ -125,19 +125,6 @@ def test_effects_that_the_trials_do_not_separate_count_as_one():
     assert tracing.verdict == max(group, key=tracing.probabilities.__getitem__)
 
 
-@pytest.mark.parametrize("kink", [0.2, 0.32])
-def test_inclusion_and_the_credible_set_add_probabilities_up(kink):
-    tracing, _ = tracing_of(measured(curve=0.14, kink=kink))
-    p = tracing.probabilities
-    for name, total in tracing.inclusion.items():
-        parts = [p[k] for k, e in tracing.evidences.items() if name in e.key.effects]
-        assert total == pytest.approx(sum(parts))
-    num = len(tracing.credible_set)
-    most = [sum(sorted(p.values())[-k:]) if k else 0.0 for k in (num - 1, num)]
-    assert sum(p[n] for n in tracing.credible_set) == pytest.approx(most[1])
-    assert most[0] < 0.9 <= most[1]
-
-
 # Sets of several effects, against all sets of a linear world
 
 
