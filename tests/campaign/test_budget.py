@@ -18,8 +18,7 @@ from sbi_active import (
 )
 from sbi_active.campaign.options import CampaignDetails
 from sbi_active.cli.record import Record, answer_of, sum_up_campaign
-from tests.campaign.problem import ACTIONS, MODEL, OPTIONS, campaign
-from tests.campaign.sizes import REFINEMENT
+from tests.campaign.problem import ACTIONS, MODEL, OPTIONS, REFINEMENT, campaign
 
 
 def pay(action):

@@ -188,10 +188,6 @@ def test_every_parameter_must_be_known_to_stop(max_sd, stops):
     reason = StopRules(max_sd=max_sd).reason(belief, None, seed=0)
     assert (reason is not None) == stops
     assert StopRules().reason(belief, None, seed=0) is None
-
-
-def test_as_many_limits_as_parameters():
-    belief = MultivariateNormal(torch.zeros(2), torch.eye(2))
     with pytest.raises(ValueError, match="one for each of 2 parameters; got 3"):
         StopRules(max_sd=[1.0, 1.0, 1.0]).reason(belief, None, seed=0)
 

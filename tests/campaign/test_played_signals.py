@@ -7,7 +7,7 @@ from sbi_active import Campaign, CampaignOptions, GaussianNoise, SimulatorModel
 from sbi_active.actions import SignalActions
 from sbi_active.actions.waveforms import step
 from sbi_active.campaign.options import CampaignDetails
-from tests.campaign.sizes import REFINEMENT
+from tests.campaign.problem import REFINEMENT
 
 GRID = torch.linspace(0, 1, 51)
 TIMES = torch.linspace(0.1, 1.0, 10)

@@ -4,24 +4,14 @@ from pathlib import Path
 
 import pytest
 
-from sbi_active.cli import main
-from tests.cli.sled import INIT, SIMULATOR
+from tests.cli.sled import SIMULATOR, made_at
 
 
 @pytest.fixture(scope="session")
 def made(tmp_path_factory):
     """A campaign with a trial that was told and one to come; made once."""
-    place = tmp_path_factory.mktemp("sled")
-    (place / "sled.py").write_text(SIMULATOR)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.chdir(place)
-        patch.setenv("XDG_STATE_HOME", str(tmp_path_factory.getbasetemp() / "state"))
-        patch.setattr(sys, "path", [*sys.path])
-        patch.delitem(sys.modules, "sled", raising=False)
-        assert main([*INIT, "sled.py:slide", "--names=speed", "--units=m/s"]) == 0
-        assert main(["tell", "camp", "0.3", "--action", "1"]) == 0
-        assert main(["ask", "camp"]) == 0
-    return place
+    named = ["--names=speed", "--units=m/s"]
+    return made_at(tmp_path_factory, SIMULATOR, "0.3", more=named)
 
 
 @pytest.fixture

@@ -9,7 +9,7 @@ import torch
 
 from sbi_active import Campaign, GaussianNoise, SimulatorModel
 from sbi_active.campaign.storage.codec import decode, encode
-from sbi_active.simulation.bank import CorruptSegmentError, store
+from sbi_active.simulation.bank import CorruptSegmentError
 from sbi_active.simulation.bank.store import LogChangedError, Store
 from tests.campaign.storage.campaigns import facts, go_on, mean, new
 from tests.simulation.bank.filled import crafted, execute
@@ -47,25 +47,6 @@ def test_a_trial_told_while_another_thread_learns_is_kept(tmp_path):
     learning.join()
     c.close()
     assert number(3) in told(tmp_path / "c")
-
-
-def test_two_writers_without_locks_refuse_before_they_write(tmp_path, monkeypatch):
-    folder = tmp_path / "c"
-    a = new(folder)
-    a.attach([1.0], number(1))
-    b = Campaign.load(folder)
-
-    def unlocked(path, mode, *, timeout):  # as on a file system whose locks do nothing
-        own = path.with_name(f"{path.name}-of-b" if path.name == "store.lock" else FILE)
-        return connected(own, mode, timeout=timeout)
-
-    with monkeypatch.context() as patch:
-        connected = store._connected
-        patch.setattr(store, "_connected", unlocked)
-        b.attach([1.0], number(2))
-    with pytest.raises(LogChangedError, match="another process told since"):
-        a.attach([2.0], number(3))
-    assert told(folder) == [number(1), number(2)]
 
 
 def test_a_lock_file_that_is_removed_cuts_nothing_off(tmp_path):
@@ -199,21 +180,3 @@ def test_crafted_files_are_one_error_that_names_the_file(tmp_path):
             survived += str(error).startswith("expected")
     # What describes and decides nothing may hold anything: a reason, a time.
     assert survived >= 0.9 * len(changes)
-
-
-def test_links_lead_nowhere(tmp_path):
-    mine = tmp_path / "mine.txt"
-    beside = ("store.lock", "store.db-wal", "store.db-shm")
-    for name in (FILE, *beside):
-        mine.write_text("precious")
-        folder = tmp_path / f"c-{name}"
-        with new(folder) as c:
-            c.attach([1.0], number(1))
-        (folder / name).unlink(missing_ok=True)
-        (folder / name).symlink_to(mine)
-        try:
-            with Campaign.load(folder) as c:
-                c.attach([1.0], number(1))
-        except OSError:
-            pass
-        assert mine.read_text() == "precious", name

@@ -1,10 +1,7 @@
 """Folders that earlier releases wrote are brought up to date, and go on."""
 
-import json
 import shutil
-import sys
 
-import numpy as np
 import pytest
 import torch
 
@@ -96,23 +93,6 @@ def test_gone_on_with_to_the_last_bit(folder):
     assert torch.equal(draws, finished(anew))
 
 
-def test_what_was_simulated_is_there_row_by_row(folder):
-    h5py = pytest.importorskip("h5py")
-    bank = Bank(folder, name="drawn")
-    bank.verify()
-    columns = {name: bank.table()[name] for name in ("theta", "index", "log_proposal")}
-    columns["x"] = bank.read().x.numpy()
-    for name, column in columns.items():
-        files = sorted(BANK.glob("segments/*.h5"))
-        parts = []
-        for path in files:
-            with h5py.File(path) as file:
-                parts.append(file[name][()])
-        assert np.array_equal(np.concatenate(parts), column, equal_nan=True)
-    header = json.loads((BANK / "bank.json").read_text())
-    assert bank.header["simulator"] == header["simulator"]
-
-
 def test_a_bank_alone_and_several_in_a_folder(tmp_path):
     shutil.copytree(BANK, tmp_path / "bank")
     assert migrate(tmp_path / "bank") == {"rows": ROWS}
@@ -162,10 +142,3 @@ def test_a_log_that_ends_within_a_line_is_said(old):
     with pytest.warns(UserWarning, match="ends within line 5, which is left out"):
         assert migrate(old)["log"] == 4
     assert (old / "version-1" / "trials.jsonl").read_bytes() == content[:-20]
-
-
-def test_without_h5py_it_says_what_to_install(old, monkeypatch):
-    monkeypatch.setitem(sys.modules, "h5py", None)
-    with pytest.raises(ImportError, match=r"pip install 'sbi-active\[migrate\]'"):
-        migrate(old)
-    assert not (old / "store.db").exists()
