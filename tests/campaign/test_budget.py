@@ -176,7 +176,7 @@ def test_pairs_tell_more_than_single_trials_for_the_same_budget():
     told = {}
     for look_ahead in (1, 2):
         options = CampaignOptions(
-            num_samples=200,
+            num_samples=64,
             network="on demand",
             refinement=REFINEMENT,
             details=CampaignDetails(num_scored=100, look_ahead=look_ahead),

@@ -19,27 +19,6 @@ page = importlib.util.module_from_spec(SPEC)
 SPEC.loader.exec_module(page)
 
 
-def test_columns_end_where_their_rule_does():
-    text = (
-        "           gap  regret\n"
-        "----  --------  ------\n"
-        "asbi  .1 | .2     0.00\n"
-        "nsbi       nan         \n"
-        "a line that is no row of the table\n"
-    )
-    assert page.as_markdown(text).split("\n") == [
-        "|  | gap | regret |",
-        "| --- | --- | --- |",
-        "| asbi | .1 \\| .2 | 0.00 |",
-        "| nsbi |  |  |",
-        "",
-        "```text",
-        "a line that is no row of the table",
-        "```",
-        "",
-    ]
-
-
 def test_each_section_shows_its_tables():
     text = (ROOT / "docs" / "benchmarks.md").read_text(encoding="utf-8")
     included = re.findall(r"{include} reference/api/results/(.+)", text)

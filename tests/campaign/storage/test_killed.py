@@ -14,7 +14,7 @@ from sbi_active import Campaign
 from tests.campaign.storage.campaigns import MODEL, draws, facts, go_on, new
 
 pytestmark = pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
-NUM_TRIALS, NUM_KILLED = 4, 5
+NUM_TRIALS, NUM_KILLED = 4, 3
 
 
 def has_manifest(folder):
