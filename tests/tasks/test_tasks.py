@@ -14,7 +14,6 @@ from sbi_active.criticism import AugmentedSimulator
 from sbi_active.tasks import get_task  # pyright: ignore
 from sbi_active.tasks.ball_drops import fall  # pyright: ignore
 from sbi_active.tasks.chain import model
-from sbi_active.tasks.location_finding import model as locations
 from sbi_active.tasks.oscillator import reference as reference_module
 from sbi_active.tasks.oscillator.model import (
     ACTION_HIGH,
@@ -123,20 +122,6 @@ def test_the_closed_form_solves_the_equations(parameters, moving):
 
 
 # Location finding: the model and the task
-
-
-def test_log_likelihood_is_a_normal_s():
-    task = get_task("location_finding")
-    gen = torch.Generator().manual_seed(0)
-    theta, action, x = (
-        torch.randn(30, dim, generator=gen, dtype=torch.float64) for dim in (4, 2, 1)
-    )
-    center = locations.mean(theta, action)
-    expected = Normal(center, locations.NOISE_SD).log_prob(x)[:, 0]
-    torch.testing.assert_close(task.log_likelihood(x, theta, action), expected)
-    mean = task.simulator.mean(theta, action)
-    torch.testing.assert_close(task.simulator.noise.log_prob(x, mean), expected)
-    assert task.exact_likelihood
 
 
 # The oscillator against its differential equation, its reference against itself

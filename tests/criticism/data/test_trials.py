@@ -13,12 +13,6 @@ from sbi_active.criticism.data.columns import to_si
 from sbi_active.mujoco import from_mjcf
 
 
-def test_ragged_trajectories_are_padded_and_masked():
-    trials = Trials([1.0, 2.0], [np.arange(3.0), np.arange(5.0)])
-    assert trials.x.shape == (2, 5)
-    assert trials.mask.sum(1).tolist() == [3, 5]
-
-
 def test_roles_names_and_places_stay_with_their_trials():
     role, names = ["fit", "held out", "fit"], ["run 7", "run 9", 12]
     trials = Trials([1.0, 2.0, 3.0], [1.0, 2.0, 3.0], role=role, names=names)
