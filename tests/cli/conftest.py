@@ -14,11 +14,16 @@ def made(tmp_path_factory):
     return made_at(tmp_path_factory, SIMULATOR, "0.3", more=named)
 
 
-@pytest.fixture
-def camp(made, tmp_path, monkeypatch):
-    """A copy of it, of which nothing is imported yet."""
-    shutil.copytree(made, tmp_path, dirs_exist_ok=True)
+@pytest.fixture(autouse=True)
+def _nothing_imported(monkeypatch):
+    """Each test imports its own programs, and leaves the path as it was."""
     monkeypatch.setattr(sys, "path", [*sys.path])
-    for name in ("sled", "odd", "tape", "mine"):
+    for name in ("sled", "odd", "tape", "mine", "line"):
         monkeypatch.delitem(sys.modules, name, raising=False)
+
+
+@pytest.fixture
+def camp(made, tmp_path):
+    """A copy of it."""
+    shutil.copytree(made, tmp_path, dirs_exist_ok=True)
     return Path("camp")
