@@ -18,7 +18,7 @@ def made(tmp_path_factory):
 def _nothing_imported(monkeypatch):
     """Each test imports its own programs, and leaves the path as it was."""
     monkeypatch.setattr(sys, "path", [*sys.path])
-    for name in ("sled", "odd", "tape", "mine", "line"):
+    for name in ("sled", "odd", "tape", "mine", "line", "my_robot", "my_motor"):
         monkeypatch.delitem(sys.modules, name, raising=False)
 
 
