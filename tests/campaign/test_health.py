@@ -3,6 +3,7 @@
 import math
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 from scipy.integrate import quad
@@ -11,7 +12,7 @@ from torch.distributions import MultivariateNormal, Normal
 
 from sbi_active.campaign import CampaignOptions, Trial
 from sbi_active.campaign.health import assess, log_e_value
-from sbi_active.campaign.score import score_outcome
+from sbi_active.campaign.score import SHARES, Spread, score_outcome
 from sbi_active.campaign.state import CampaignState, ModelVersion
 from sbi_active.seeding import derive_seed, forked_generators
 from sbi_active.simulation import simulate
@@ -205,3 +206,21 @@ def test_a_channel_in_small_units_counts(num_numbers):
     assert score_outcome(x, drawn)[0] > 0.9
     x[0] = 4e-7
     assert score_outcome(x, drawn)[0] == 1 / 101
+
+
+@pytest.mark.parametrize(("num", "num_numbers"), [(30, 5), (4, 3), (12, 20)])
+def test_the_share_of_the_diagonal_is_the_best_without_each_row(num, num_numbers):
+    gen = torch.Generator().manual_seed(2)
+    mix = torch.randn(num_numbers, num_numbers, generator=gen).double()
+    z = torch.randn(num, num_numbers, generator=gen).double() @ mix
+    z = (z - z.mean(0)) / z.std(0, correction=0)
+    losses, unit = [], torch.eye(num_numbers).double()
+    for share in SHARES:
+        loss = 0.0
+        for i in range(num):
+            rest = z[torch.arange(num) != i]
+            c = (1 - share) * rest.T @ rest / (num - 1) + share * unit
+            loss += float(c.logdet() + z[i] @ torch.linalg.solve(c, z[i]))
+        losses.append(loss)
+    best = SHARES[int(np.argmin(losses))]
+    assert Spread.of(z).share == pytest.approx(float(best), rel=1e-3)

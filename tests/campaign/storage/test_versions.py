@@ -1,7 +1,9 @@
 """Folders that earlier releases wrote are brought up to date, and go on."""
 
+import json
 import shutil
 
+import numpy as np
 import pytest
 import torch
 
@@ -91,6 +93,23 @@ def test_gone_on_with_to_the_last_bit(folder):
     anew.attach([1.5], [0.4, float("nan"), 1.0])
     anew.ask()
     assert torch.equal(draws, finished(anew))
+
+
+def test_what_was_simulated_is_there_row_by_row(folder):
+    h5py = pytest.importorskip("h5py")
+    bank = Bank(folder, name="drawn")
+    bank.verify()
+    columns = {name: bank.table()[name] for name in ("theta", "index", "log_proposal")}
+    columns["x"] = bank.read().x.numpy()
+    for name, column in columns.items():
+        files = sorted(BANK.glob("segments/*.h5"))
+        parts = []
+        for path in files:
+            with h5py.File(path) as file:
+                parts.append(file[name][()])
+        assert np.array_equal(np.concatenate(parts), column, equal_nan=True)
+    header = json.loads((BANK / "bank.json").read_text())
+    assert bank.header["simulator"] == header["simulator"]
 
 
 def test_a_bank_alone_and_several_in_a_folder(tmp_path):

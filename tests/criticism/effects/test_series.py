@@ -63,6 +63,19 @@ def test_a_delay_by_steps_shifts():
     assert torch.allclose(half[:, 1:], (u[:, 1:] + u[:, :-1]) / 2)
 
 
+def test_a_backlash_is_that_of_its_definition():
+    u, width = random(3, 57).cumsum(1), column(0.0, 1.0, 4.0)
+    expected = torch.empty_like(u)
+    y = u[:, 0]
+    for k in range(57):
+        y = torch.minimum(
+            torch.maximum(y, u[:, k] - width[:, 0] / 2), u[:, k] + width[:, 0] / 2
+        )
+        expected[:, k] = y
+    assert torch.equal(played(u, width), expected)
+    assert torch.equal(expected[0], u[0])
+
+
 @pytest.mark.parametrize("channels", [(), (2,)])
 def test_a_sensor_s_lag_is_that_of_fine_integration(channels):
     times = torch.tensor([0.0, 0.1, 0.25, 0.3, 0.7, 1.0]).double()

@@ -105,6 +105,28 @@ def test_the_evidence_is_that_of_the_dense_integral(ragged):
     assert found[0].log_evidence == pytest.approx(log_mean(alone))
 
 
+def test_a_parameter_that_differs_from_trial_to_trial_is_a_dense_integral_too():
+    model, plain = problem()
+    m, widths = plain.measurements, [model.widened(width) for width in WIDTHS]
+    varying = np.stack([3 * model.jacobian[:, 0], np.zeros(len(m))], 1)
+    errors = errors_of(m, varying)
+    found, without = both_of(errors, model), both_of(plain, model)
+    j = model.jacobian[:, 0] / np.sqrt(np.mean(model.jacobian[:, 0] ** 2))
+    same = m.trial[:, None] == m.trial
+    covariances = [
+        np.eye(len(m)) + size**2 * np.outer(column, column) * same
+        for column in (j, 0 * j)
+        for size in errors.sizes[::2]
+    ]
+    varies = log_mean(dense(model, covariances, widths)[0])
+    both = log_mean([without[1].log_evidence, varies])
+    assert found[1].log_evidence == pytest.approx(both)
+    assert errors.process(found[1]) == pytest.approx(plain.process(without[1]))
+    use = np.arange(errors.num_folds) != 3
+    part, without = both_of(errors, model, use), both_of(plain, model, use)
+    assert part[0].log_evidence == without[0].log_evidence
+
+
 def test_a_bound_of_phi_counts_by_the_posterior_within_it():
     free, errors = problem()
     bounded, _ = problem(low=0.0)

@@ -12,8 +12,13 @@ from sbi.utils import BoxUniform
 
 from sbi_active.criticism import joint_prior
 from sbi_active.criticism.contradictions import SevereTest
+from sbi_active.criticism.report.figures import (
+    AFTER,
+    BEFORE,
+    plot_residuals,
+)
 from sbi_active.criticism.report.sections import head
-from tests.criticism.report.reports import DRAG, report, tracing
+from tests.criticism.report.reports import DRAG, report, residuals, tracing
 from tests.display.parsed import Parsed
 
 TESTS = (SevereTest(action=np.array([3.0]), is_permitted=True, difference=1.234),)
@@ -82,3 +87,28 @@ def test_save_writes_the_page_and_every_figure(tmp_path):
     assert page.read_text().count("data:image/svg+xml;base64,") == 2
     for name in pictures:
         assert image.imread(page.parent / name).std() > 0.01  # something is drawn
+
+
+# What the figures of a report draw, number by number
+
+
+def points(ax):
+    """Return what is drawn as points, shape (n, 2), a row each, in one order."""
+    drawn = [line.get_xydata() for line in ax.lines if line.get_marker() == "."]
+    return sorted(map(tuple, np.concatenate(drawn)))
+
+
+@pytest.mark.parametrize("num", [1, 6])
+def test_every_residual_is_drawn_at_its_action_its_trial_and_its_channel(num):
+    both = residuals((num,), size=4.0), residuals((num,))
+    figure = plot_residuals(*both, action_labels=["speed"], added="a gain")
+    columns = 2 if num == 1 else 3
+    assert len(figure.axes) == 2 * columns
+    for row, (made, color) in enumerate(zip(both, (BEFORE, AFTER), strict=True)):
+        panels = figure.axes[row * columns : (row + 1) * columns]
+        channel = np.tile(np.arange(num), len(made.index))
+        places = [np.repeat(made.action[:, 0], num), np.repeat(made.index, num)]
+        for ax, place in zip(panels, [*places, channel], strict=False):
+            expected = sorted(zip(place, made.refitted.ravel(), strict=True))
+            np.testing.assert_allclose(points(ax), expected)
+            assert {line.get_color() for line in ax.lines[:num]} == {color}

@@ -110,6 +110,15 @@ def test_effects_that_the_trials_do_not_separate_count_as_one():
     assert tracing.verdict == max(group, key=tracing.probabilities.__getitem__)
 
 
+def test_the_credible_set_has_nine_tenths_of_the_probability_and_no_more_names():
+    tracing, _ = tracing_of(measured(curve=0.14, kink=0.2))
+    p, num = tracing.probabilities, len(tracing.credible_set)
+    least, less = (sum(sorted(p.values())[-k:]) for k in (num, num - 1))
+    assert sum(p[n] for n in tracing.credible_set) == pytest.approx(least)
+    assert num > 1
+    assert less < 0.9 <= least
+
+
 # Sets of several effects, against all sets of a linear world
 
 

@@ -16,6 +16,8 @@ from sbi_active.inference.sampling.gaussian_process import GaussianProcess
 from sbi_active.inference.sampling.least_squares import within
 from sbi_active.inference.sampling.mixtures import (
     StudentMixture,
+    fitted_normals,
+    lower_factors,
 )
 from sbi_active.inference.sampling.smc import bridge
 from sbi_active.inference.sampling.truncated import log_inside, truncated_normal
@@ -65,6 +67,14 @@ def test_robust_representations_take_over(never_converges, shape):
 
 
 # Gaussian mixtures fitted to points
+
+
+def test_mixture_handles_repeated_points():
+    rng = np.random.default_rng(0)
+    points = np.repeat(rng.standard_normal((3, 2)), 100, axis=0)
+    mixture = fitted_normals(points, 6, rng)
+    assert np.isfinite(mixture.factors).all()
+    assert len(np.unique(mixture.log_parts(points).argmax(0))) <= 3
 
 
 # Gaussian processes on few simulations
@@ -141,6 +151,17 @@ def test_a_split_mixture_is_normalized_and_matches_its_draws():
     for region in (lambda u: u[:, 0] > 3.0, lambda u: u[:, 1] > u[:, 0]):
         expected = (ratio * region(z)).mean()
         assert region(draws).mean() == pytest.approx(expected, abs=0.02)
+
+
+def test_a_singular_covariance_has_its_smallest_variances_raised():
+    covariance = np.array([[1.0, 1.0], [1.0, 1.0]])[None] - 1e-16
+    covariance = np.concatenate([covariance, [[[1.0, 2.0], [2.0, 1.0]]]])
+    factor = lower_factors(covariance)
+    assert (np.triu(factor, 1) == 0).all()
+    assert (np.diagonal(factor, axis1=1, axis2=2) > 0).all()
+    assert (factor @ np.swapaxes(factor, 1, 2))[0] == pytest.approx(
+        covariance[0], abs=1e-9
+    )
 
 
 # Evidences and moments of densities whose integral is known

@@ -1,0 +1,46 @@
+"""Derivatives of a linearized model."""
+
+import numpy as np
+import torch
+from sbi.utils import BoxUniform
+
+from sbi_active import GaussianNoise, SimulatorModel
+from sbi_active.criticism import Trials
+from sbi_active.criticism.evidence.rival_set import RivalSet
+from sbi_active.criticism.linear.model import centered, linearize
+from sbi_active.criticism.results import ModelKey
+
+PRIOR = BoxUniform(torch.tensor([1.0, 0.5]), torch.tensor([20.0, 2.0]))
+SD = 1e-6
+
+
+def rival():
+    def saturating(theta, xi):
+        return torch.tanh(0.1 * xi * theta[:, :1] * theta[:, 1:])
+
+    model = SimulatorModel(saturating, noise=GaussianNoise(SD))
+    xi = torch.linspace(0.5, 1.5, 8)[:, None]
+    trials = Trials(xi, torch.tanh(0.99 * xi))
+    return RivalSet(model, PRIOR, trials, []).rival(ModelKey())
+
+
+def told(model):
+    """Return how much the trials tell of the direction that they tell least of."""
+    return np.linalg.svd(model.jacobian, compute_uv=False)[-1]
+
+
+def test_slopes_from_both_sides_tell_nothing_of_what_a_product_leaves_open():
+    own, unit = rival(), np.full(8, SD)
+    u = own.coordinates.from_z(np.array([[9.0, 1.1]]))[0]
+    one_sided = linearize(own, u, unit)
+    assert told(one_sided) > 1
+    assert told(centered(own, one_sided, unit)) < 0.1
+
+
+def test_at_a_bound_the_slope_is_from_within():
+    own, unit = rival(), np.full(8, SD)
+    for corner in (own.coordinates.low, own.coordinates.high):
+        one_sided = linearize(own, corner, unit)
+        both = centered(own, one_sided, unit)
+        np.testing.assert_allclose(both.jacobian, one_sided.jacobian)
+        assert np.isfinite(both.jacobian).all()
