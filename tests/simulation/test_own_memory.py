@@ -15,6 +15,7 @@ from sbi_active import (
     SimulatorModel,
     simulate,
 )
+from sbi_active.inference.rounds.condition import action_rows, outcome_rows
 from sbi_active.seeding import row_normals
 from sbi_active.simulation import MissingRowsWarning
 
@@ -39,12 +40,24 @@ def one_row(theta, action, rng, *, context):
     return context.qpos
 
 
+def one_number(theta, action, rng, *, context):
+    context.qpos[0] = theta[0]
+    return context.qpos[:1]
+
+
 @pytest.mark.parametrize("options", ENGINE)
 @pytest.mark.parametrize("noise", [None, GaussianNoise(0.0)])
 def test_rows_that_return_a_view_keep_their_own_x(options, noise):
     model = SimulatorModel(one_row, batched=False, setup=State, noise=noise)
     x = simulate(model, THETA, ACTION, seed=0, **options).x
     assert torch.equal(x, torch.cat([THETA, -ACTION], 1))
+
+
+def test_the_mean_of_rows_that_return_a_view():
+    noise = GaussianNoise(0.1)
+    model = SimulatorModel(one_number, batched=False, setup=State, noise=noise)
+    mean = model.mean(THETA, ACTION)
+    assert torch.equal(mean.float(), THETA)
 
 
 class Buffer:
@@ -215,3 +228,11 @@ def test_actions_keep_the_values_that_were_given():
         given += 5
     assert listed.values.flatten().tolist() == [0.0, 1.0, 2.0]
     assert (box.low.item(), box.high.item()) == (0.0, 1.0)
+
+
+def test_conditions_are_rows_of_their_own():
+    x, action = torch.ones(3, 2), torch.ones(3, 1)
+    rows = outcome_rows(x, (2,)), action_rows(action, 1)
+    x.zero_()
+    action.zero_()
+    assert all(r.unique().tolist() == [1.0] for r in rows)

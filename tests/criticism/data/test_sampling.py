@@ -57,6 +57,13 @@ def test_the_sensor_s_error_on_top_counts_by_its_size():
     assert 40 <= suggested_sampling(trials_of(x), x).every <= 100
 
 
+def test_at_least_eight_samples_are_left():
+    x = np.sin(np.arange(40) / 30 + np.arange(6)[:, None])
+    assert suggested_sampling(trials_of(x), x).every <= 5
+    short = x[:, :7]
+    assert suggested_sampling(trials_of(short), short).every == 1
+
+
 def test_gaps_several_channels_and_ragged_trials():
     rng = np.random.default_rng(2)
     x = np.stack([smooth(6, 400, 5, rng), 1e3 * smooth(6, 400, 5, rng)], -1)
@@ -73,6 +80,19 @@ def test_gaps_several_channels_and_ragged_trials():
 
 def sampling(every, step=1.0):
     return Sampling(step=step, every=every, before=0.9, after=0.1)
+
+
+def test_thinning_masks_and_changes_nothing_else():
+    x = torch.arange(24.0).reshape(2, 6, 2)
+    given = {"sample_times": torch.arange(6.0), "names": ["a", "b"]}
+    trials = Trials([1.0, 2.0], x, role=["fit", "held out"], **given)
+    few = thinned(trials, sampling(3))
+    assert few.mask[0, :, 0].tolist() == [False, False, True, False, False, True]
+    assert few.x[1, 5].tolist() == [22, 23]
+    assert torch.equal(few.sample_times, trials.sample_times)
+    assert (few.names, few.role) == (trials.names, trials.role)
+    assert trials.mask.all()
+    assert torch.equal(thinned(trials, sampling(1)).x, trials.x)
 
 
 def test_channels_of_other_rates_and_short_trials_keep_their_own():

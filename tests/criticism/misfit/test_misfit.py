@@ -10,7 +10,6 @@ from sbi_active.criticism.misfit import record
 from sbi_active.criticism.misfit.guesses import MARGIN, guess_residual
 from sbi_active.criticism.results import ModelKey
 from sbi_active.criticism.steps.detection import THRESHOLD
-from sbi_active.criticism.steps.predictive import find_residuals
 from tests.criticism.misfit.oscillator import (
     ACTION,
     EFFECTS,
@@ -51,14 +50,6 @@ def test_the_cause_is_named_beside_what_nobody_declared(named):
     without = loop(named.trials, EFFECTS[:2]).trace()  # nothing takes its place
     assert without.verdict == "unexplained"
     assert without.misfit.named == ()
-
-
-def test_residuals_are_those_of_the_best_fit(named):
-    """Draws as wide as the misfit leave the valley that parameters make up for."""
-    key, search = named.trace().key, named.misfit().search
-    left = find_residuals(named.rivals, key)
-    own = (left.x - left.mean).ravel()[search.errors.measurements.position]
-    assert own == pytest.approx(search.unit * search.model(key).residual, abs=1e-6)
 
 
 @pytest.mark.parametrize("effects", [{}, {"friction": 0.2}])

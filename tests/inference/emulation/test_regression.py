@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from sbi_active.inference.emulation.regression import Regression
-from sbi_active.inference.emulation.solving import whole_space
+from sbi_active.inference.emulation.solving import around, whole_space
 
 NUM = 400
 
@@ -61,3 +61,22 @@ def test_expected_error_is_the_mean_divergence(num: int):
         actual.append(np.log(np.exp(ratio - top).mean()) + top - ratio.mean())
     error = np.std(actual) / len(actual) ** 0.5
     assert np.mean(expected) == pytest.approx(np.mean(actual), rel=0.3, abs=3 * error)
+
+
+def test_distant_simulations_count_where_the_response_is_simple():
+    rng = np.random.default_rng(0)
+    z = np.concatenate(
+        [0.1 * rng.standard_normal((200, 1)), rng.uniform(-1, 1, (200, 1))]
+    )
+    region, none = (
+        around(0.03 * rng.standard_normal((500, 1))),
+        np.zeros((0, 2), dtype=int),
+    )
+    reaches = {}
+    for curve in (lambda z: z, lambda z: np.sign(z) * (np.abs(z) > 0.4) + z):
+        x = curve(z) + 0.05 * rng.standard_normal(z.shape)
+        fit = Regression.fit(region, z, x, none, np.zeros(1, dtype=int), np.zeros(1))
+        reaches[curve] = fit.basis.reach * 0.03
+    near, far = sorted(reaches.values())
+    assert list(reaches.values()) == [far, near]
+    assert near < 0.6 < far

@@ -12,7 +12,8 @@ from sbi.utils import BoxUniform
 
 from sbi_active import ALHI, MixtureDensity, SeqBED
 from sbi_active.inference import LFIRE, SeqBED_LFIRE
-from sbi_active.inference.models.factors import Product
+from sbi_active.inference.beliefs.weighted import KernelBelief
+from sbi_active.inference.models.factors import Product, trained_region
 from sbi_active.inference.networks.ratio_network import RatioClassifier
 from sbi_active.inference.rounds.rows import Observation
 from sbi_active.inference.sampling.coordinates import PriorCoordinates
@@ -97,6 +98,17 @@ def test_the_product_is_sbi_s_condition_on_theta():
         table = model.log_likelihood_table(x, theta, action[0])
         row = model.log_likelihood(x[:1].expand(20, -1), theta, action[:1])
     assert table[0].tolist() == pytest.approx(row.tolist(), abs=1e-4)
+
+
+def test_where_no_network_was_trained_there_is_no_likelihood():
+    """Of no rows at all, bounds of a belief cannot be checked."""
+    box, rng = BoxUniform(-torch.ones(2), torch.ones(2)), np.random.default_rng(0)
+    coordinates = PriorCoordinates(box, rng)
+    region = trained_region(0.01 * rng.standard_normal((500, 2)), rng)
+    before = KernelBelief(box, 0.01 * torch.randn(50, 2))
+    product = Product(coordinates, None, [], region, before)
+    assert np.isneginf(product.log_likelihood(np.full((3, 2), 0.9))).all()
+    assert np.isfinite(product.log_likelihood(np.zeros((1, 2)))).all()
 
 
 @pytest.mark.parametrize("posterior", ["importance", "kde"])
