@@ -14,6 +14,7 @@ from sbi_active.campaign import CampaignOptions, Trial
 from sbi_active.campaign.health import assess, log_e_value
 from sbi_active.campaign.score import SHARES, Spread, score_outcome
 from sbi_active.campaign.state import CampaignState, ModelVersion
+from sbi_active.inference.sampling.weights import silverman
 from sbi_active.seeding import derive_seed, forked_generators
 from sbi_active.simulation import simulate
 
@@ -196,6 +197,26 @@ def test_only_measured_numbers_are_compared():
     assert score_outcome(whole, drawn)[0] <= 2 / 501
 
 
+@pytest.mark.parametrize(("num", "num_numbers"), [(400, 12), (60, 150)])
+def test_the_log_score_of_many_numbers_is_a_gaussian_s(num, num_numbers):
+    """Its covariance is shrunk to the diagonal; here it is dense, and no product."""
+    gen = torch.Generator().manual_seed(1)
+    mix = torch.randn(num_numbers, num_numbers, generator=gen).double()
+    drawn = torch.randn(num, num_numbers, generator=gen).double() @ mix
+    x = torch.randn(num_numbers, generator=gen).double() @ mix
+    share = Spread.of(drawn).share
+    covariance = torch.cov(drawn.T, correction=0)
+    diagonal = covariance.diagonal() * (1 + 1e-10)
+    covariance = (1 - share) * covariance + share * diagonal.diag()
+    exact = MultivariateNormal(drawn.mean(0), covariance).log_prob(x)
+    known = math.log((num + 0.5) / (num + 1))
+    assert score_outcome(x, drawn)[1] == pytest.approx(float(exact) + known, rel=1e-6)
+    # Neither order nor units change the surprise.
+    surprise = score_outcome(x, drawn)[0]
+    units = torch.logspace(-6, 6, num_numbers).double()
+    assert score_outcome(units * x, units * drawn.flip(0))[0] == surprise
+
+
 @pytest.mark.parametrize("num_numbers", [2, 30])
 def test_a_channel_in_small_units_counts(num_numbers):
     """Radians beside pascals: forty deviations had a tail probability of .52."""
@@ -224,3 +245,15 @@ def test_the_share_of_the_diagonal_is_the_best_without_each_row(num, num_numbers
         losses.append(loss)
     best = SHARES[int(np.argmin(losses))]
     assert Spread.of(z).share == pytest.approx(float(best), rel=1e-3)
+
+
+def test_two_modes_have_the_density_of_kernels():
+    gen = torch.Generator().manual_seed(3)
+    side = torch.where(torch.rand(4_000, 1, generator=gen) < 0.5, -1.0, 1.0)
+    drawn = 3 * side + 0.3 * torch.randn(4_000, 1, generator=gen)
+    log_score = score_outcome(torch.tensor([3.0]), drawn)[1]
+    gaussian = Normal(0.0, math.sqrt(9.09)).log_prob(torch.tensor(3.0)).exp()
+    width = math.sqrt(0.09 + (silverman(4_000, 1) ** 2) * 9.09)
+    kernels = 0.5 * Normal(0.0, width).log_prob(torch.tensor(0.0)).exp()
+    exact = float(((gaussian + kernels) / 2).log())
+    assert log_score == pytest.approx(exact, abs=0.05)

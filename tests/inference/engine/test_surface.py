@@ -16,8 +16,10 @@ from sbi_active.inference.engine.surface import (
     Screened,
     Surface,
     SurfacePotential,
+    features,
     fitted_surface,
 )
+from sbi_active.inference.sampling.least_squares import descend
 from sbi_active.inference.sampling.mixtures import StudentMixture
 from tests.inference.engine.test_engine import Given
 
@@ -45,6 +47,11 @@ def evidence_of_bent(sd, bend, num=400_000):
     return float(logsumexp(log_prior) - np.log(num))
 
 
+def test_features_are_all_products():
+    z = np.array([[2.0, 3.0]])
+    assert features(z, 3)[0].tolist() == [1, 2, 3, 4, 6, 9, 8, 12, 18, 27]
+
+
 def test_a_polynomial_response_is_predicted_where_no_draw_was():
     own, rng = bent(), np.random.default_rng(0)
     pool = Pool.empty(6, 1)
@@ -57,6 +64,13 @@ def test_a_polynomial_response_is_predicted_where_no_draw_was():
     assert surface.efficiency == pytest.approx(1.0, abs=1e-6)
     far = 2 * rng.standard_normal((50, 6))
     assert surface.log_likelihood(far) == pytest.approx(own.log_likelihood(far))
+
+
+def test_few_draws_have_no_surface():
+    own, rng = bent(), np.random.default_rng(0)
+    pool = Pool.empty(6, 1)
+    pool.add(PriorDraws(own), X + 0.1 * rng.standard_normal((10, 6)), own)
+    assert fitted_surface(own, lambda r: r, pool, rng, SurfaceSettings()) is None
 
 
 @pytest.mark.parametrize("shift", [0.0, 1.0, 30.0])
@@ -91,3 +105,12 @@ def test_most_draws_of_a_bent_posterior_count():
     assert found.log_evidence == pytest.approx(exact, abs=error)
     assert found.effective_sample_size > 0.5 * found.pool.num_final
     assert found.tail_shape < 0.7
+
+
+def test_a_search_ends_at_the_bottom_of_a_bent_valley():
+    own = bent(sd=0.01)
+    start = np.full((1, 6), 2.0)
+    end, cost = descend(own, start, lambda r: r, 3e-3, 30)
+    assert (own.residual(end)[0] ** 2).sum() + (end**2).sum() == pytest.approx(cost[0])
+    again, _ = descend(own, end, lambda r: r, 3e-3, 30)
+    assert again == pytest.approx(end, abs=1e-3)
