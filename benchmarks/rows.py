@@ -12,6 +12,7 @@ import json
 import sys
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from datetime import date
 from itertools import product
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
@@ -239,6 +240,12 @@ def keep(path: Path, rows: Mapping[str, Any]) -> None:
     """Write all stages of a JSON file."""
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(json.dumps(rows, indent=1) + "\n")
+
+
+def recorded(path: Path, command: str, **figures: Any) -> None:
+    """Write figures to a JSON file, with the command that made them and the date."""
+    made = {"command": f"python -m benchmarks {command}", "date": str(date.today())}
+    keep(path, made | figures)
 
 
 def add(path: Path, rows: dict[str, Any], name: str, row: Mapping[str, Any]) -> None:

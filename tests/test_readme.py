@@ -12,6 +12,8 @@ from types import SimpleNamespace
 import pytest
 import torch
 
+from sbi_active import InformationGainDesigner
+from sbi_active.campaign.learning import planner
 from sbi_active.campaign.learning.learner import Learner
 from sbi_active.design import GradientSearch, designer
 
@@ -53,7 +55,7 @@ def run(tmp_path, monkeypatch):
     """Return a function that runs a page, and returns the names of each snippet.
 
     README runs as printed. On the other pages a network is trained where something asks
-    for it, and a search for the next action is short.
+    for it, and a search for the next action is short and of few simulations.
     """
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.chdir(tmp_path)
@@ -65,6 +67,7 @@ def run(tmp_path, monkeypatch):
         if name != "README.md":
             quick = partial(GradientSearch, num_rounds=1, num_starts=4)
             monkeypatch.setattr(designer, "GradientSearch", quick)
+            monkeypatch.setattr(planner, "InformationGainDesigner", of_few_simulations)
             monkeypatch.setattr(Learner, "trains_each_round", False)
         text = (ROOT / name).read_text()
         for snippet in re.findall(r"```python\n(.*?)```", text, re.DOTALL):
@@ -80,6 +83,10 @@ def run(tmp_path, monkeypatch):
 
     yield page
     forget()
+
+
+def of_few_simulations(actions, **options) -> InformationGainDesigner:
+    return InformationGainDesigner(actions, **{**options, "num_samples": 200})
 
 
 def forget():

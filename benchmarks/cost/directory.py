@@ -1,13 +1,11 @@
-"""What keeping a campaign on disk costs: a tell, a load, a round.
+"""What keeping a campaign on disk costs: a tell, a load.
 
     python -m benchmarks cost.directory
 
 * a ``tell`` of 100 numbers, in memory and on disk, and the ``fsync`` alone of a file of
   as many bytes, in turn;
 * ``Campaign.load`` of a campaign of 200 trials of 100 numbers, and of its belief, which
-  was inferred from all of them at once;
-* CPU seconds of the update by one trial of ten numbers as trials grow from 1 to 100, on
-  disk and in memory in turn.
+  was inferred from all of them at once.
 
 Writes directory.json beside this file.
 """
@@ -19,7 +17,6 @@ import tempfile
 import time
 from collections.abc import Callable
 from dataclasses import replace
-from datetime import date
 from functools import partial
 from pathlib import Path
 from statistics import median
@@ -29,7 +26,7 @@ import torch
 from sbi.utils import BoxUniform
 from torch import Tensor
 
-from benchmarks.rows import keep
+from benchmarks.rows import recorded
 from sbi_active import (
     BoxActions,
     Campaign,
@@ -42,9 +39,7 @@ from sbi_active.campaign.options import CampaignDetails
 from sbi_active.seeding import forked_generators
 
 RESULT = Path(__file__).with_suffix(".json")
-NUMBERS, TRIALS, AFTER = 100, 200, (12, 25, 50, 100)
-FEW = 10  # numbers of a trial, where what each round costs is measured
-REPEATS = 30
+NUMBERS, TRIALS, REPEATS = 100, 200, 30
 PRIOR = BoxUniform(torch.zeros(2), torch.ones(2))
 ACTIONS = BoxActions([0.5], [2.0])
 OPTIONS = CampaignOptions(
@@ -55,29 +50,25 @@ OPTIONS = CampaignOptions(
 THETA = torch.tensor([[0.3, 0.6]])
 
 
-def line(num: int) -> SimulatorModel:
-    """Return the model of a straight line of so many numbers."""
-
-    def values(theta: Tensor, action: Tensor) -> Tensor:
-        return theta[:, :1] * action + theta[:, 1:] * torch.linspace(0, 1, num)
-
-    return SimulatorModel(values, noise=GaussianNoise(0.5))
+def line(theta: Tensor, action: Tensor) -> Tensor:
+    """Return a straight line of so many numbers."""
+    return theta[:, :1] * action + theta[:, 1:] * torch.linspace(0, 1, NUMBERS)
 
 
-LONG, SHORT = line(NUMBERS), line(FEW)
+MODEL = SimulatorModel(line, noise=GaussianNoise(0.5))
 
 
-def trial(index: int, model: SimulatorModel = LONG) -> tuple[Tensor, Tensor]:
+def trial(index: int) -> tuple[Tensor, Tensor]:
     """Return an action and what it measures."""
     with forked_generators(7, "real", index):
         action = 0.5 + 1.5 * torch.rand(1)
-        return action, model(THETA, action[None])[0]
+        return action, MODEL(THETA, action[None])[0]
 
 
-def begin(folder: Path | None, model: SimulatorModel = LONG) -> Campaign:
+def begin(folder: Path | None) -> Campaign:
     """Return a new campaign."""
     return Campaign(
-        *(model, PRIOR, ACTIONS), method="nsbi", options=OPTIONS, directory=folder
+        *(MODEL, PRIOR, ACTIONS), method="nsbi", options=OPTIONS, directory=folder
     )
 
 
@@ -108,25 +99,6 @@ def _synchronized(path: Path) -> None:
         os.fsync(file.fileno())
 
 
-def rounds(folder: Path) -> list[dict[str, float]]:
-    """Return CPU seconds of an update after so many trials, with and without a disk."""
-    kept = {"disk": begin(folder / "rounds", SHORT), "memory": begin(None, SHORT)}
-    rows = []
-    for index in range(max(AFTER)):
-        action, x = trial(index, SHORT)
-        spent = {}
-        for name, campaign in kept.items():
-            campaign.attach(action, x)
-            start = time.process_time()
-            campaign.update()
-            spent[name] = round(time.process_time() - start, 3)
-        rows.append({"trials": index + 1, **spent})
-        if index + 1 in AFTER:
-            print(rows[-1], flush=True)
-    kept["disk"].close()
-    return rows
-
-
 def load(folder: Path) -> dict[str, float]:
     """Return seconds of a load, and of the belief, which is read when asked for."""
     with begin(folder / "long") as campaign:
@@ -138,7 +110,7 @@ def load(folder: Path) -> dict[str, float]:
         state.is_stale = True
         campaign.update()
     start = time.perf_counter()
-    campaign = Campaign.load(folder / "long", simulator=LONG)
+    campaign = Campaign.load(folder / "long", simulator=MODEL)
     loaded = time.perf_counter() - start
     _ = campaign.belief.mean
     size = sum(p.stat().st_size for p in (folder / "long").rglob("*") if p.is_file())
@@ -154,16 +126,6 @@ def main() -> None:
     """Measure, print and write."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        result: dict[str, Any] = {"date": str(date.today()), "tell_ms": tells(folder)}
-        print(result["tell_ms"], flush=True)
-        result["update_cpu_s"] = rounds(folder)
-        result["load"] = load(folder)
-        print(result["load"])
-    by_count = {row["trials"]: row for row in result["update_cpu_s"]}
-    near = {
-        count: median(by_count[k]["disk"] for k in range(max(count - 5, 1), count + 1))
-        for count in AFTER
-    }
-    result["update_cpu_s_near"] = near
-    print(near)
-    keep(RESULT, result)
+        result = {"tell_ms": tells(folder), "load": load(folder)}
+    print(result)
+    recorded(RESULT, "cost.directory", **result)

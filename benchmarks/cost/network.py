@@ -13,14 +13,13 @@ from __future__ import annotations
 
 import json
 import os
-from datetime import date
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from benchmarks.rounds import played
-from benchmarks.rows import keep
+from benchmarks.rows import recorded
 from sbi_active import CampaignOptions
 from sbi_active.seeding import forked_generators
 from sbi_active.tasks import get_task  # pyright: ignore
@@ -51,12 +50,8 @@ def main() -> None:
     for seed in range(SEEDS):
         for mode in MODES:
             made[mode].append(rounds(mode, seed, ROUNDS))
-    result: dict[str, Any] = {
-        "command": "python -m benchmarks cost.network",
-        "date": date.today().isoformat(),
-        "machine": f"{os.cpu_count()} cores, no GPU",
-        "task": "numerical, declared noise",
-    }
+    result: dict[str, Any] = {"machine": f"{os.cpu_count()} cores, no GPU"}
+    result["task"] = "numerical, declared noise"
     for mode, campaigns in made.items():
         rows = [row for campaign, _ in campaigns for row in campaign]
         each = np.array([row["cpu_s"] for row in rows])
@@ -69,8 +64,7 @@ def main() -> None:
         }
     both = [result[mode]["cpu_s_a_round"] for mode in MODES]
     result["ratio"] = both[0] / both[1]
-    path = Path(__file__).with_name("network.json")
-    keep(path, result)
+    recorded(Path(__file__).with_name("network.json"), "cost.network", **result)
     for mode in MODES:
         print(f"{mode}: {json.dumps(result[mode])}")
     print(f"ratio: {result['ratio']:.1f}")

@@ -12,13 +12,12 @@ design and update together. sbi runs first and so pays what torch does once a pr
 from __future__ import annotations
 
 import time
-from datetime import date
 from pathlib import Path
 
 import torch
 from sbi.inference import NPE_C
 
-from benchmarks.rows import keep
+from benchmarks.rows import recorded
 from sbi_active import Campaign
 from sbi_active.inference.trainers.action_rounds import SilentTracker
 from sbi_active.seeding import derive_seed
@@ -59,16 +58,9 @@ def main() -> None:
     default = [default_round(seed) for seed in range(3)]
     theirs = stock["cpu_s"]
     ours = sum(r["cpu_s"] for r in default) / len(default)
-    result = {
-        "command": "python -m benchmarks cost",
-        "date": date.today().isoformat(),
-        "rows": NUM_ROWS,
-        "default_round": default,
-        "stock_npe_c": stock,
-        "ratio": theirs / ours,
-    }
+    made = {"rows": NUM_ROWS, "default_round": default, "stock_npe_c": stock}
     path = Path(__file__).parent / "result.json"
-    keep(path, result)
+    recorded(path, "cost", **made, ratio=theirs / ours)
     print(f"stock NPE_C(prior), training:    {theirs:7.2f} CPU s")
     print(f"default loop, a whole round:     {ours:7.2f} CPU s")
     print(f"ratio:                           {theirs / ours:7.1f}")

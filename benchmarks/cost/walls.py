@@ -108,8 +108,8 @@ def measure(kind: str, num: int) -> dict[str, float]:
 
 def main() -> None:
     """Run what is not there yet, and write it down."""
-    found = {"rounds": {}} | stages(RESULT)
-    found["date"] = date.today().isoformat()
+    found: dict[str, Any] = {"rounds": {}} | stages(RESULT)
+    found["date"] = str(date.today())
     for name, kind, num in [(f"{n:,} {k}", k, n) for k in SIZES for n in SIZES[k]]:
         if name in found["rounds"]:
             continue

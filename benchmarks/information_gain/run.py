@@ -27,7 +27,6 @@ from sbi_active.inference import Belief
 from sbi_active.seeding import derive_seed, forked_generators
 from sbi_active.tasks import Task, get_task
 
-VARIANTS = ("linear", "sinh", "square")
 NETWORKS = {"faithful": MixtureDensity.faithful(), "default": MixtureDensity()}
 
 

@@ -21,11 +21,10 @@ import tempfile
 import xml.etree.ElementTree as ET
 from collections import Counter
 from collections.abc import Sequence
-from datetime import date
 from importlib.metadata import version
 from pathlib import Path
 
-from benchmarks.rows import keep
+from benchmarks.rows import recorded
 
 HERE = Path(__file__).parent
 USES_NPE = re.compile(r"\b(NPE_C|NPE|SNPE|SNPE_C)\b")
@@ -78,15 +77,12 @@ def main() -> None:
         for name in sorted(original.keys() | swapped.keys())
         if original.get(name) != swapped.get(name)
     }
-    result = {
-        "command": "python -m benchmarks sbi_suite",
-        "date": date.today().isoformat(),
+    found = {
         "sbi": version("sbi"),
-        "files": [*chosen],
         "original": Counter(original.values()),
         "swapped": Counter(swapped.values()),
         "differ": differ,
     }
-    keep(HERE / "result.json", result)
-    print(json.dumps({k: v for k, v in result.items() if k != "files"}, indent=2))
+    recorded(HERE / "result.json", "sbi_suite", files=[*chosen], **found)
+    print(json.dumps(found, indent=2))
     sys.exit(bool(differ))

@@ -47,10 +47,9 @@ TABLES = {
     "Source location finding": ("location_finding --summary",),
     "What an adversary found": (
         "robustness --summary",
-        "robustness.exact --summary",
         "robustness.health --summary",
     ),
-    "Campaigns on disk": ("table cost/directory.json --only tell* load,* *near*",),
+    "Campaigns on disk": ("table cost/directory.json --only tell* load,*",),
     "Box collision": (
         "box_collision --summary",
         "box_collision --summary --setting coverage --target prior --seeds 0 40",

@@ -8,8 +8,6 @@ import numpy as np
 import pandas as pd
 import pytest
 import torch
-from torch import Tensor
-from torch.distributions import Normal
 
 from benchmarks.__main__ import main as run
 from benchmarks.bits.run import FIGURES, figures, runs
@@ -19,7 +17,6 @@ from benchmarks.criticism.worlds import get_world
 from benchmarks.experiments.run import Reality
 from benchmarks.forces.machines import machine
 from benchmarks.location_finding import run as location
-from benchmarks.location_finding.bounds import contrastive_bounds
 from benchmarks.measured.cascaded_tanks import fit_tanks, score
 from benchmarks.measured.removals import removed, table
 from benchmarks.misfit import cases as misfit_cases
@@ -72,15 +69,6 @@ def test_the_truth_of_a_case_runs_the_trial_that_was_drawn():
     x = reality.run(truth.action[k])
     assert torch.allclose(x, truth.measured(torch.tensor([k]))[0])
     assert reality.index == k + 1
-
-
-def test_permitted_actions_reach_beyond_those_of_the_trials():
-    near, far = (Reality.of(6_000, "B outside", reach) for reach in (1.0, 1.5))
-    tried = far.problem.trials.fit.action.abs().max()
-    assert near.actions.values.abs().max() <= 3.0 < far.actions.values.abs().max()
-    assert far.actions.values.abs().max() > tried
-    assert far.run(far.actions.values[0]).shape == far.problem.trials.x.shape[1:]
-    assert not far.right & {e.name for e in far.problem.effects}
 
 
 def test_what_is_removed_is_not_named_and_aliases_are_counted():
@@ -170,42 +158,6 @@ def test_the_regulator_s_gains_cost_least():
 
 
 # Location finding: bounds of the information against a closed form, and a roll-out
-
-
-def normal(*shape: int, seed: int) -> Tensor:
-    generator = torch.Generator().manual_seed(seed)
-    return torch.randn(shape, generator=generator, dtype=torch.float64)
-
-
-def linear_gaussian(n: int, num_contrastive: int) -> tuple[Tensor, Tensor]:
-    """Return log p(h|theta_0) and log p(h|theta_l) of x_t = a_t theta + noise.
-
-    The information is .5 log(1 + sum a_t^2).
-    """
-    slope = torch.tensor([1.0, 2.0, -1.5], dtype=torch.float64)
-    theta = normal(n, 1, seed=0)
-    x = theta * slope + normal(n, 3, seed=1)
-    other = normal(n, num_contrastive, 1, seed=2)
-    log_p_true = Normal(theta * slope, 1).log_prob(x).sum(1)
-    return log_p_true, Normal(other * slope, 1).log_prob(x[:, None]).sum(2)
-
-
-INFORMATION = 0.5 * math.log(1 + 1 + 4 + 2.25)
-
-
-@pytest.mark.parametrize("num_contrastive", [5, 1_000])
-def test_contrastive_bounds_bracket_the_linear_gaussian_information(num_contrastive):
-    lower, upper = contrastive_bounds(*linear_gaussian(4_000, num_contrastive))
-    error_lower, error_upper = (float(b.std()) / 4_000**0.5 for b in (lower, upper))
-    assert float(lower.mean()) < INFORMATION + 3 * error_lower
-    assert float(upper.mean()) > INFORMATION - 3 * error_upper
-    assert bool((lower <= math.log(num_contrastive + 1)).all())
-    if num_contrastive == 5:  # few draws: neither is the information
-        assert float(lower.mean()) < INFORMATION - 5 * error_lower
-        assert float(upper.mean()) > INFORMATION + 5 * error_upper
-    else:
-        assert float(lower.mean()) > INFORMATION - 4 * error_lower
-        assert float(upper.mean()) < INFORMATION + 4 * error_upper
 
 
 def test_a_roll_out_has_its_row_and_the_table_its_line(monkeypatch):

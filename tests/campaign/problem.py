@@ -10,15 +10,16 @@ from sbi_active import (
     DiscreteActions,
     GaussianNoise,
     MixtureDensity,
+    RefinementOptions,
     SimulatorModel,
 )
 from sbi_active.campaign.options import CampaignDetails
 from sbi_active.inference.networks.ratio_network import RatioClassifier
-from tests.campaign.sizes import REFINEMENT
 
 PRIOR = BoxUniform(torch.zeros(1), torch.ones(1))
 ACTIONS = DiscreteActions([0.5, 1.0, 3.0])
 MODEL = SimulatorModel(lambda theta, action: theta * action, noise=GaussianNoise(0.1))
+REFINEMENT = RefinementOptions(num_histories=200, num_effective=25)
 DETAILS = CampaignDetails(num_scored=200)
 OPTIONS = CampaignOptions(
     num_simulations=300,

@@ -18,8 +18,7 @@ from sbi_active import (
 )
 from sbi_active.campaign.options import CampaignDetails
 from sbi_active.cli.record import Record, answer_of, sum_up_campaign
-from tests.campaign.problem import ACTIONS, MODEL, OPTIONS, campaign
-from tests.campaign.sizes import REFINEMENT
+from tests.campaign.problem import ACTIONS, MODEL, OPTIONS, REFINEMENT, campaign
 
 
 def pay(action):
@@ -143,10 +142,6 @@ def test_resume_keeps_what_is_spent(tmp_path):
 def test_a_cost_is_a_positive_number_an_action():
     with pytest.raises(ValueError, match="expected positive costs of shape"):
         within(5.0, lambda action, previous: 0 * action[:, 0])
-    with pytest.raises(ValueError, match="expected budget > 0 or None; got 0.0"):
-        StopRules(budget=0.0)
-    with pytest.raises(ValueError, match="expected look_ahead among 1, 2; got 3"):
-        CampaignDetails(look_ahead=3)
 
 
 # Two far places of two measurements each, on both sides of a near and poor one
@@ -181,7 +176,7 @@ def test_pairs_tell_more_than_single_trials_for_the_same_budget():
     told = {}
     for look_ahead in (1, 2):
         options = CampaignOptions(
-            num_samples=200,
+            num_samples=64,
             network="on demand",
             refinement=REFINEMENT,
             details=CampaignDetails(num_scored=100, look_ahead=look_ahead),

@@ -14,11 +14,11 @@ from sbi_active.simulation import Workers
 from tests.campaign.problem import (
     ACTIONS,
     PRIOR,
+    REFINEMENT,
     campaign,
     draws,
     noisy,
 )
-from tests.campaign.sizes import REFINEMENT
 from tests.effects import BIAS
 
 TOLD = [(1.0, 0.62), (3.0, 1.75), (0.5, 0.33)]  # action, x at theta = .6

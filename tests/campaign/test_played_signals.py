@@ -3,13 +3,13 @@
 import torch
 from sbi.utils import BoxUniform
 
-from sbi_active import Campaign, CampaignOptions, GaussianNoise, SimulatorModel
+from sbi_active import Campaign, GaussianNoise, SimulatorModel
 from sbi_active.actions import SignalActions
 from sbi_active.actions.waveforms import step
-from sbi_active.campaign.options import CampaignDetails
-from tests.campaign.sizes import REFINEMENT
+from tests.campaign.problem import OPTIONS
 
-GRID = torch.linspace(0, 1, 51)
+STEP = 0.05
+GRID = torch.linspace(0, 1, 21)
 TIMES = torch.linspace(0.1, 1.0, 10)
 SPACE = SignalActions(
     step("voltage", begin=0.1),
@@ -21,24 +21,18 @@ SPACE = SignalActions(
 )
 PRIOR = BoxUniform(torch.tensor([1.0, 0.05]), torch.tensor([5.0, 0.5]))
 TRUTH = torch.tensor([[3.0, 0.2]])
-OPTIONS = CampaignOptions(
-    num_samples=200,
-    details=CampaignDetails(num_scored=500),
-    network="on demand",
-    refinement=REFINEMENT,
-)
 
 
 def speed(theta, action, *, inputs, times):
     """A first-order motor, tau w' = k u - w, on the grid of its voltage."""
     gain, tau = theta.unbind(1)
-    keep = torch.exp(-0.02 / tau)
+    keep = torch.exp(-STEP / tau)
     w, found = torch.zeros_like(gain), []
     for u in inputs["voltage"].unbind(1):
         found.append(w)
         w = keep * w + (1 - keep) * gain * u
     series = torch.stack(found, 1)
-    return series.gather(1, (times / 0.02).round().long())
+    return series.gather(1, (times / STEP).round().long())
 
 
 MODEL = SimulatorModel(
@@ -63,7 +57,7 @@ def test_a_campaign_asks_for_signals_and_learns():
     campaign = Campaign(MODEL, PRIOR, SPACE, options=OPTIONS, seed=0)
     trial = campaign.ask()
     assert bool(SPACE.contains(trial.action))
-    assert SPACE.inputs(trial.action)["voltage"].shape == (51,)
+    assert SPACE.inputs(trial.action)["voltage"].shape == GRID.shape
     campaign.tell(motor(trial.action, 0))
     for k, action in enumerate(SPACE.sample((2,), seed=1), 1):
         campaign.attach(action, motor(action, k))

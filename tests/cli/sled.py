@@ -7,6 +7,8 @@ import os
 import subprocess
 import sys
 
+import pytest
+
 from sbi_active.campaign.telling import SUMMARY
 from sbi_active.cli import main
 from sbi_active.simulation.bank.store import Store
@@ -24,6 +26,21 @@ SIZES = ["num_simulations=200", "details.num_scored=500", "network=on demand"]
 SIZES += ["refinement.num_histories=200", "refinement.num_effective=25"]
 SMALL = ["--noise", "0.02", "--method", "nsbi", *(f"--set={s}" for s in SIZES)]
 INIT = ["init", "camp", *BOX, *SMALL, "--actions", "0.5:3", "--simulator"]
+
+
+def made_at(places, simulator, *told, more=()):
+    """Return a new folder with a campaign of a trial that was told and one to come."""
+    place = places.mktemp("sled")
+    (place / "sled.py").write_text(simulator)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(place)
+        patch.setenv("XDG_STATE_HOME", str(places.getbasetemp() / "state"))
+        patch.setattr(sys, "path", [*sys.path])
+        patch.delitem(sys.modules, "sled", raising=False)
+        assert main([*INIT, "sled.py:slide", *more]) == 0
+        assert main(["tell", "camp", *told, "--action", "1"]) == 0
+        assert main(["ask", "camp"]) == 0
+    return place
 
 
 def run(words, *, flags=(), env=(), **options):

@@ -125,7 +125,17 @@ CALLS = [
     ),
     (1, "by zero", [*OF, "odd.py:broken", *ASK]),
     (130, "interrupted", [*OF, "odd.py:stopped", *ASK]),
-    (2, "expected what 'numerical' needs", "run numerical --out o --option target=2"),
+    *(
+        (2, text, f"run {words}")
+        for text, words in (
+            ("expected what 'numerical' needs", "numerical --out o --option target=2"),
+            ("expected a task among 'numerical'", "numerica --out d"),
+            ("Invalid value for '--rounds': 0", "numerical --out d --rounds 0"),
+            ("expected a setting of", "numerical --out d --set sized=3"),
+            ("expected NAME=VALUE; got 'seed'", "numerical --out d --set seed"),
+            ("extra argument (seed)", "numerical --out d --set stop=3 seed"),
+        )
+    ),
 ]
 
 

@@ -61,7 +61,6 @@ def line(theta, action):
 
 def test_a_missing_effect_is_found_and_adopted(capsys, monkeypatch, tmp_path):
     monkeypatch.setattr(problem, "generic_effects", lambda *_, **__: [])
-    monkeypatch.setattr(sys, "path", [*sys.path])
     Path("line.py").write_text(LINE)
     Path("tape.py").write_text(TAPE)
     words = ["--simulator", "line.py:line", "--theta-low", "0", "--theta-high", "1"]

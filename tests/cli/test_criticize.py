@@ -1,11 +1,9 @@
 """``sbi-active criticize``: from a file to a report."""
 
 import functools
-import sys
 from pathlib import Path
 from types import SimpleNamespace
 
-import pandas as pd
 import pytest
 import torch
 
@@ -62,48 +60,6 @@ def test_a_file_gives_a_report(capsys):
     assert "saved: found/report.html" in printed
     with open("found/report.txt") as file:
         assert file.read().strip() in printed
-
-
-SLIDE = """
-import torch
-from torch.distributions import HalfNormal
-from sbi_active.criticism import Effect
-
-def place(theta, action, *, times, drag=None):
-    loss = 9.81 * theta
-    if drag is None:
-        s = torch.minimum(times, action / loss)
-        return action * s - loss * s**2 / 2
-    loss, k = loss.double(), drag * torch.ones_like(action).double()
-    root, edge = (loss * k).sqrt(), (action * (k / loss).sqrt()).atan()
-    s = torch.minimum(times, edge / root)
-    return ((edge - root * s).cos() / edge.cos()).log() / k
-
-effects = [
-    Effect("drag", hook="dynamics", prior=HalfNormal(0.3), null=0.0, units="1/m",
-           apply=lambda value, phi, action, context: {
-               **value, "drag": phi.clamp(min=1e-6)})
-]
-"""
-
-
-def film(module="my_slide"):
-    """Write a film of a block with drag, one row a sample, at uneven times."""
-    space: dict = {}
-    exec(SLIDE, space)
-    gen = torch.Generator().manual_seed(0)
-    rows = []
-    for i, v in enumerate([1.0, 2.5, 1.5, 3.0, 2.0, 1.25, 2.75]):
-        times = (torch.arange(6 + i % 2) / 10 + 0.05)[None].double()
-        at = [torch.tensor([[value]]).double() for value in (0.4, v)]
-        x = space["place"](*at, times=times, drag=0.3)[0]
-        x = x + 0.003 * torch.randn(len(x), generator=gen)
-        role = "fit" if i < 5 else "held out"
-        for t, value in zip(times[0].tolist(), x.tolist(), strict=True):
-            rows.append(f"p{i},{1000 * t:.0f},{v},{value:.4f},{role}")
-    write(rows, "push,time_ms,action_speed[m/s],x_place[m],role")
-    with open(f"{module}.py", "w") as file:
-        file.write(SLIDE)
 
 
 @pytest.fixture
@@ -168,30 +124,19 @@ def test_inputs_stand_in_a_file_of_their_own(compared, capsys):
     assert (given.thin, given.seed) == (False, 7)
 
 
-def folder_of_films(folder="films"):
-    """Write one file a push, and the simulator beside them."""
-    Path(folder).mkdir()
-    sys.modules.pop("my_swing", None)  # of another test
-    film(f"{folder}/my_swing")
-    table = pd.read_csv("trials.csv")
-    for i, push in enumerate(table["push"].unique()):
-        rows = table[table["push"] == push].drop(columns="push")
-        rows["role"] = "held out" if i == 2 else "fit"
-        rows.to_csv(f"{folder}/push {i + 1}.csv", index=False)
-    Path("trials.csv").rename("all.csv")
-    return Path(folder), len(table["push"].unique())
-
-
-def test_a_folder_of_recordings(capsys):
-    folder, _ = folder_of_films()
-    words = ["criticize", str(folder), "--simulator", f"{folder}/my_swing.py:place"]
-    words += ["--theta-low=0.1", "--theta-high=1", "--noise=0.004", "--seed=3"]
-    for column in ("time=time_ms", "x=x_place", "action=action_speed", "role=role"):
+def test_a_folder_of_recordings_with_columns_of_other_names(compared):
+    Path("my_robot.py").write_text(ROBOT)
+    Path("pushes").mkdir()
+    for k, role in enumerate(("fit", "fit", "held out")):
+        rows = f"v,s,part\n{k + 1},{0.1 * k},{role}\n"
+        Path(f"pushes/push {k}.csv").write_text(rows)
+    words = ["criticize", "pushes", "--simulator", "my_robot.py:distance", *OPTIONS]
+    for column in ("x=s", "action=v", "role=part"):
         words += ["--columns", column]
     assert main(words) == 0
-    printed = capsys.readouterr().out
-    assert printed.startswith("Verdict: drag")
-    assert "held-out trial push 3: " in printed
+    (given,) = compared
+    assert given.trials.action[:, 0].tolist() == [1, 2, 3]
+    assert given.trials.role == ["fit", "fit", "held out"]
 
 
 def test_a_task_gives_its_simulator_and_prior(capsys):

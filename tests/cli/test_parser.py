@@ -42,21 +42,6 @@ def test_nothing_heavy_is_imported(arguments, status, text):
 
 
 @pytest.mark.parametrize(
-    ("line", "text"),
-    [
-        ("run numerica --out d", "expected a task among 'numerical'"),
-        ("run numerical --out d --rounds 0", "Invalid value for '--rounds': 0"),
-        ("run numerical --out d --set sized=3", "expected a setting of a campaign"),
-        ("run numerical --out d --set seed", "expected NAME=VALUE; got 'seed'"),
-        ("run numerical --out d --set stop=3 seed", "unexpected extra argument (seed)"),
-    ],
-)
-def test_a_slip_is_named(line, text, capsys):
-    assert main(line.split()) == 2
-    assert text in capsys.readouterr().err
-
-
-@pytest.mark.parametrize(
     ("line", "kind", "text"),
     [
         ("fly camp", "NoSuchCommand", "No such command 'fly'"),

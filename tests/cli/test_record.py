@@ -3,7 +3,6 @@
 import contextlib
 import json
 import shutil
-import sys
 from pathlib import Path
 
 import pytest
@@ -11,9 +10,8 @@ import pytest
 from sbi_active import Campaign
 from sbi_active.cli import main, record
 from sbi_active.cli.problem import open_campaign
-from tests.cli.sled import SIMULATOR, SMALL, forget, run
+from tests.cli.sled import SIMULATOR, forget, made_at, run
 
-BOUNDS = ["--theta-low=0.2,0", "--theta-high=1,1"]
 TWO = SIMULATOR.replace("    return ", "    x = ") + (
     "    return torch.stack([x[:, 0], 2 * x[:, 0]], 1)\n"
 )
@@ -21,26 +19,8 @@ TWO = SIMULATOR.replace("    return ", "    x = ") + (
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory):
-    """A campaign with a trial that the belief has used and one to come."""
-    place = tmp_path_factory.mktemp("record")
-    (place / "sled.py").write_text(TWO)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.chdir(place)
-        patch.setattr(sys, "path", [*sys.path])
-        patch.delitem(sys.modules, "sled", raising=False)
-        words = ["--simulator", "sled.py:slide", "--actions", "0.5:3"]
-        assert main(["init", "camp", *words, *BOUNDS, *SMALL]) == 0
-        assert main(["tell", "camp", "0.3", "0.6", "--action", "1"]) == 0
-        assert main(["ask", "camp"]) == 0
-    return place
-
-
-@pytest.fixture
-def camp(made, tmp_path, monkeypatch):
-    shutil.copytree(made, tmp_path, dirs_exist_ok=True)
-    monkeypatch.setattr(sys, "path", [*sys.path])
-    monkeypatch.delitem(sys.modules, "sled", raising=False)
-    return Path("camp")
+    """A campaign of outcomes of two numbers."""
+    return made_at(tmp_path_factory, TWO, "0.3", "0.6")
 
 
 @pytest.mark.parametrize(

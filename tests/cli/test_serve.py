@@ -3,7 +3,6 @@
 import json
 import signal
 import subprocess
-import sys
 
 import pytest
 
@@ -25,11 +24,9 @@ def broken(theta, action):
 
 
 @pytest.fixture
-def camp(tmp_path, monkeypatch):
+def camp(tmp_path):
     """A campaign without trials."""
     (tmp_path / "sled.py").write_text(SIMULATOR + LOUD)
-    monkeypatch.setattr(sys, "path", [*sys.path])
-    monkeypatch.delitem(sys.modules, "sled", raising=False)
     words = ["--actions", "0.5:3", "--simulator", "sled.py:loud"]
     sizes = [*SMALL, "--set", "num_samples=200"]
     assert main(["init", "camp", *BOX, *sizes, *words]) == 0

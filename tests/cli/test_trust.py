@@ -46,9 +46,8 @@ NAMED = ["--simulator", "mine.py:slide"]
 
 
 @pytest.fixture
-def mine(tmp_path, monkeypatch, request):
+def mine(tmp_path, request):
     """A campaign whose simulator, prior and actions are programs, or only the first."""
-    monkeypatch.setattr(sys, "path", [*sys.path])
     ran = tmp_path / "ran"
     forget(ran)
     program = MINE.format(run=RUN.format(ran))

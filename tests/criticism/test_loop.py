@@ -220,6 +220,11 @@ LOST = torch.tensor([torch.nan, torch.nan, 1.0])
 SCATTER = effect("scatter", hook="noise", apply=lambda sd, *_: sd)
 
 
+SWAPPED = Trials(ONES, torch.ones(3, 2), channel_labels=LABELS)
+BEYOND = Trials(ONES, MORE, sample_times=[0, 0.5, 1.5])
+NONE_FIT = Trials(ONES, LOST, role=["fit", "fit", "held out"])
+
+
 @pytest.mark.parametrize(
     ("message", "changes"),
     [
@@ -227,23 +232,11 @@ SCATTER = effect("scatter", hook="noise", apply=lambda sd, *_: sd)
         ("noise would count twice", {"model": SimulatorModel(noisy, noise=NOISE)}),
         ("at least two valid trials to fit; got 1", {"trials": measured(1, {}, num=1)}),
         ("trials of the simulator's shape", {"trials": Trials(ONES, torch.ones(3, 4))}),
-        (
-            "at least two valid trials to fit; got 0",
-            {"trials": Trials(ONES, LOST, role=["fit", "fit", "held out"])},
-        ),
+        ("at least two valid trials to fit; got 0", {"trials": NONE_FIT}),
         ("expected effects not named none", {"effects": [SCATTER]}),
         ("actions of dimension 1", {"actions": DiscreteActions([[1.0, 2.0]])}),
-        (
-            "channels, rail, swing; got swing, rail",
-            {
-                "model": TWO,
-                "trials": Trials(ONES, torch.ones(3, 2), channel_labels=LABELS),
-            },
-        ),
-        (
-            "times within those of the simulator, 0 to 1",
-            {"model": TIMED, "trials": Trials(ONES, MORE, sample_times=[0, 0.5, 1.5])},
-        ),
+        ("rail, swing; got swing, rail", {"model": TWO, "trials": SWAPPED}),
+        ("those of the simulator, 0 to 1", {"model": TIMED, "trials": BEYOND}),
     ],
 )
 def test_what_cannot_be_compared(message, changes):

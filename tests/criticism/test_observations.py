@@ -11,9 +11,7 @@ from torch.distributions import Independent, MultivariateNormal, Normal
 from sbi_active import DiscreteActions, GaussianNoise, SimulatorModel
 from sbi_active.criticism import AugmentedSimulator, Criticism, Trials
 from sbi_active.criticism.evidence.rival_set import RivalSet
-from sbi_active.criticism.rivals.rival import (
-    DISAGREEMENT,
-)
+from sbi_active.criticism.rivals.rival import DISAGREEMENT
 from sbi_active.criticism.rivals.trial_simulator import NUM_REPLICATES, TrialSimulator
 from sbi_active.criticism.steps.predictive import predict
 from tests.effects import effect
@@ -53,27 +51,31 @@ def exact(action, x, extra=0.0):
 # Outcomes
 
 
+FLAG = math.log(DISAGREEMENT / (1 - DISAGREEMENT))
+
+
+def require_evidence(models, expected):
+    found = models.fit().evidence
+    assert found.standard_error < 0.2
+    assert found.log_evidence == pytest.approx(expected, abs=4 * found.standard_error)
+
+
 def test_a_trial_without_a_measurement_costs_its_flag():
     x = X.clone()
     x[2] = torch.nan
-    found = rivals(line, Trials(ACTION, x)).fit().evidence
     keep = x[:, 0].isfinite()
-    expected = exact(ACTION[keep], X[keep, 0])
-    expected += math.log(DISAGREEMENT / (1 - DISAGREEMENT))
-    assert found.log_evidence == pytest.approx(expected, abs=4 * found.standard_error)
+    require_evidence(
+        rivals(line, Trials(ACTION, x)), exact(ACTION[keep], X[keep, 0]) + FLAG
+    )
 
 
 def test_a_measurement_where_there_should_be_none_has_the_prior_predictive():
-    trials = Trials(ACTION, X)
-    models = rivals(ending, trials)
-    found = models.fit().evidence
-    keep = ACTION[:, 0] <= 1
+    models, keep = rivals(ending, Trials(ACTION, X)), ACTION[:, 0] <= 1
     lost = ~keep.numpy()
-    expected = exact(ACTION[keep], X[keep, 0])
     center, spread = models.center[lost], models.spread[lost]
+    expected = exact(ACTION[keep], X[keep, 0]) + lost.sum() * FLAG
     expected += norm.logpdf(X[~keep, 0].numpy(), center, spread).sum()
-    expected += lost.sum() * math.log(DISAGREEMENT / (1 - DISAGREEMENT))
-    assert found.log_evidence == pytest.approx(expected, abs=4 * found.standard_error)
+    require_evidence(models, expected)
 
 
 def test_a_random_simulator_gives_its_own_probability_of_an_outcome():
@@ -104,16 +106,13 @@ def test_masked_numbers_are_left_out():
 
     x = torch.cat([X, torch.full_like(X, torch.nan)], 1)
     x[3] = x[3].flip(0)
-    found = rivals(two, Trials(ACTION, x)).fit().evidence
-    expected = exact(ACTION, X[:, 0])
-    assert found.log_evidence == pytest.approx(expected, abs=4 * found.standard_error)
+    require_evidence(rivals(two, Trials(ACTION, x)), exact(ACTION, X[:, 0]))
 
 
 def test_a_nuisance_of_each_trial_is_integrated_out_and_drawn_for_another():
     models = rivals(line, Trials(ACTION, X), [START])
-    found, evidence = models.fit().evidence, exact(ACTION, X[:, 0], extra=0.8)
-    assert found.standard_error < 0.2
-    assert found.log_evidence == pytest.approx(evidence, abs=4 * found.standard_error)
+    evidence = exact(ACTION, X[:, 0], extra=0.8)
+    require_evidence(models, evidence)
     # Only draws in the tail of the nuisance reach the second: of 4,000, each of one of
     # some 170 effective particles, an error of .1 to .15.
     new = Trials([0.5, 1.5], [1.0, 5.0])

@@ -103,12 +103,6 @@ def test_an_effect_for_which_one_doubtful_trial_speaks_is_not_named():
     assert 7.0 in found.needed or not found.instead_of
 
 
-def test_without_an_alarm_no_trial_is_suspected():
-    found = criticism(measured()).trace()
-    assert found.verdict == "none"
-    assert found.outliers == {}
-
-
 @pytest.mark.parametrize("noise", [GaussianNoise(100.0), StudentTNoise(100.0, 4.0)])
 def test_noise_declared_too_large_is_seen(noise):
     x = measured()

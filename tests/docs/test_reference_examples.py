@@ -2,13 +2,12 @@
 
 import doctest
 import importlib
-import importlib.util
 import inspect
-from pathlib import Path
 
 import pytest
 
-ROOT = Path(__file__).parents[2]
+from tests.docs import extension
+
 #: Names that need an extra, and the attribute of a module that it brings.
 OPTIONAL = {
     "from_sysid": ("mujoco.sysid", "ModelSequences"),
@@ -17,15 +16,7 @@ OPTIONAL = {
 FLAGS = doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE
 pytest.importorskip("sphinx")
 
-spec = importlib.util.spec_from_file_location(
-    "reference", ROOT / "docs" / "_ext" / "reference.py"
-)
-assert spec is not None
-assert spec.loader is not None
-reference = importlib.util.module_from_spec(spec)
-spec.loader.exec_module(reference)
-
-
+reference = extension("reference")
 DEAR = {"pyro": pytest.mark.slow}  # trains a network
 
 

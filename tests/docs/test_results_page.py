@@ -1,43 +1,13 @@
 """What benchmarks print becomes tables of the site, from committed rows."""
 
-import importlib.util
 import re
-from pathlib import Path
 
 import pytest
 
-ROOT = Path(__file__).parents[2]
-
+from tests.docs import ROOT, extension
 
 pytest.importorskip("sphinx")
-SPEC = importlib.util.spec_from_file_location(
-    "results", ROOT / "docs" / "_ext" / "results.py"
-)
-assert SPEC is not None
-assert SPEC.loader is not None
-page = importlib.util.module_from_spec(SPEC)
-SPEC.loader.exec_module(page)
-
-
-def test_columns_end_where_their_rule_does():
-    text = (
-        "           gap  regret\n"
-        "----  --------  ------\n"
-        "asbi  .1 | .2     0.00\n"
-        "nsbi       nan         \n"
-        "a line that is no row of the table\n"
-    )
-    assert page.as_markdown(text).split("\n") == [
-        "|  | gap | regret |",
-        "| --- | --- | --- |",
-        "| asbi | .1 \\| .2 | 0.00 |",
-        "| nsbi |  |  |",
-        "",
-        "```text",
-        "a line that is no row of the table",
-        "```",
-        "",
-    ]
+page = extension("results")
 
 
 def test_each_section_shows_its_tables():

@@ -103,11 +103,6 @@ def test_there_is_one_door():
     assert plain == []
 
 
-def test_the_page_is_the_registry():
-    page = (ROOT / "docs" / "howto" / "warnings.md").read_text(encoding="utf-8")
-    assert "{include} ../../sbi_active/messages.md" in page
-
-
 def test_warnings_as_python_shows_them():
     with warnings.catch_warnings(record=True) as noted:
         warnings.simplefilter("always")

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 from sbi_active.identifiability.formula import Combination, Term
-from sbi_active.identifiability.search import FormulaSettings, search
 
 NAMES = [*"abcdef"]
 
@@ -44,33 +43,3 @@ def test_formulas_read_as_they_compute(combination, text):
     scope = {"a": theta[:, 0], "b": theta[:, 1], "exp": np.exp}
     value = eval(text.replace("^", "**"), scope)
     assert combination.value(theta) == pytest.approx(value)
-
-
-def gaussian(num, num_trials, seed, sd=0.05):
-    """Moments of sums under a linear model; logarithms are not to be had."""
-    rng = np.random.default_rng(seed)
-    design = rng.standard_normal((num_trials, num))
-    covariance = np.linalg.inv(np.eye(num) + design.T @ design / sd**2)
-
-    def moments(terms):
-        at = [t.index for t in terms]
-        return covariance[np.ix_(at, at)], np.eye(num)[np.ix_(at, at)]
-
-    return moments, covariance
-
-
-@pytest.mark.parametrize(("num", "share"), [(2, 0.5), (5, 0.9), (12, 0.5), (20, 0.1)])
-def test_what_is_found_is_known_and_new(num, share):
-    for seed in range(3):
-        num_trials = max(int(share * num), 1)
-        moments, covariance = gaussian(num, num_trials, seed)
-        low, span = np.full(num, -3.0), np.full(num, 6.0)
-        found = search(moments, range(num), low, span)
-        rows = np.zeros((len(found), num))
-        for row, (combination, own) in zip(rows, found, strict=True):
-            row[[*combination.index]] = combination.weight
-            row /= np.linalg.norm(row)
-            assert own == pytest.approx(np.sqrt(row @ covariance @ row), rel=1e-6)
-            alone = np.sqrt(covariance.diagonal()[[*combination.index]])
-            assert own <= FormulaSettings().known * alone.min()
-        assert np.linalg.matrix_rank(rows, tol=1e-4) == len(found) <= num_trials

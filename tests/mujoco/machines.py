@@ -1,4 +1,7 @@
-"""Two machines that tests of MuJoCo simulators share: a ball, an arm that is held."""
+"""Machines that tests of MuJoCo simulators share, and the bare loop beside them."""
+
+import mujoco
+import numpy as np
 
 BALL = """
 <mujoco model="bouncing ball">
@@ -33,3 +36,27 @@ GAINS = {"position": 'kp="50"', "velocity": 'kv="2"', "motor": 'gear="3"'}
 def held_arm(name: str, kind: str = "position", integrator: str = "Euler") -> str:
     """Return an arm that an equality holds, with an actuator of a name and kind."""
     return HELD.format(name=name, kind=kind, gain=GAINS[kind], integrator=integrator)
+
+
+def stepped(text, num_steps, *, key=False, control=None, **fields):
+    """Return the sensors of each step of a bare loop, shape (num_steps, k).
+
+    Args:
+        text: The MJCF.
+        num_steps: Number of steps; sensors are of their beginning.
+        key: Whether it starts from the first keyframe.
+        control: Control of the first actuator, held.
+        fields: First entries of fields, those of the model before those of the state.
+    """
+    model = mujoco.MjModel.from_xml_string(text)
+    data, rows = mujoco.MjData(model), []
+    if key:
+        mujoco.mj_resetDataKeyframe(model, data, 0)
+    for field, value in fields.items():
+        getattr(model if hasattr(model, field) else data, field).flat[0] = value
+    if control is not None:
+        data.ctrl[0] = control
+    for _ in range(num_steps):
+        mujoco.mj_step(model, data)
+        rows.append(data.sensordata.copy())
+    return np.array(rows)

@@ -1,25 +1,20 @@
 """A robot's parameters from logs of one that has dry friction besides."""
 
-import mujoco
 import numpy as np
 import pytest
 
 from benchmarks.robots.models import PENDULUM
 from sbi_active.mujoco import from_mjcf, identify_robot
+from tests.mujoco.machines import stepped
 
 TRUTH = 0.03
 
 
 def log(start, rng, friction):
     text = PENDULUM.replace("0.03", f'{TRUTH}" frictionloss="{friction}')
-    own = mujoco.MjModel.from_xml_string(text)
-    data, angles = mujoco.MjData(own), []
-    data.qpos[0] = start
-    for _ in range(200):
-        angles.append(data.qpos[0] + 0.005 * rng.standard_normal())
-        mujoco.mj_step(own, data)
-    time = 0.01 * np.arange(200)
-    begin = np.full(100, start)
+    angles = [start, *stepped(text, 200, qpos=start)[1:, 0]]
+    angles = np.array(angles) + 0.005 * rng.standard_normal(200)
+    time, begin = 0.01 * np.arange(200), np.full(100, start)
     return {"time": time[::2], "encoder": angles[::2], "start hinge": begin}
 
 

@@ -15,6 +15,7 @@ from sbi_active.criticism import Trials
 from sbi_active.mujoco import from_mjcf
 from sbi_active.mujoco.robot import Robot
 from sbi_active.simulation import Outcome, simulate
+from tests.mujoco.machines import stepped
 
 RELEASE = BoxActions([-1.5], [1.5], names=["hinge"])
 
@@ -38,16 +39,9 @@ def test_a_pendulum_moves_as_one_stepped_by_hand():
     for row in range(2):
         damping, mass = theta[row].tolist()
         text = PENDULUM.replace('damping="0.03"', f'damping="{damping!r}"')
-        model = mujoco.MjModel.from_xml_string(
-            text.replace('mass="1"', f'mass="{mass!r}"')
-        )
-        data = mujoco.MjData(model)
-        data.qpos[0] = action[row, 0]
-        angles = []
-        for _ in range(151):
-            angles.append(data.qpos[0])
-            mujoco.mj_step(model, data)
-        assert x[row].numpy() == pytest.approx(np.array(angles)[10::10], abs=1e-12)
+        text = text.replace('mass="1"', f'mass="{mass!r}"')
+        angles = stepped(text, 151, qpos=action[row, 0])[10::10, 0]
+        assert x[row].numpy() == pytest.approx(angles, abs=1e-12)
 
 
 def test_rows_do_not_depend_on_batches_or_workers():

@@ -1,13 +1,12 @@
 """What a motion starts from: keyframes, and what a name sets."""
 
-import mujoco
 import numpy as np
 import pytest
 import torch
 
 from sbi_active import BoxActions
 from sbi_active.mujoco import from_mjcf
-from tests.mujoco.machines import GAINS, held_arm
+from tests.mujoco.machines import GAINS, held_arm, stepped
 
 TENDON = """
 <mujoco>
@@ -53,21 +52,6 @@ def held(name: str, **options) -> list[float]:
     return robot.simulator.mean(torch.tensor([[0.1]]).double(), value)[0].tolist()
 
 
-def by_hand(*, key: bool, **start: float) -> list[float]:
-    model = mujoco.MjModel.from_xml_string(held_arm("servo"))
-    model.dof_damping[0] = 0.1
-    data = mujoco.MjData(model)
-    if key:
-        mujoco.mj_resetDataKeyframe(model, data, 0)
-    for field, value in start.items():
-        getattr(data, field)[0] = value
-    for _ in range(251):
-        mujoco.mj_step(model, data)
-        if data.time == model.opt.timestep:
-            first = float(data.sensordata[0])
-    return [first, float(data.sensordata[0])]
-
-
 @pytest.mark.parametrize("integrator", ["Euler", "RK4", "implicit", "implicitfast"])
 @pytest.mark.parametrize("kind", GAINS)
 def test_rows_of_a_held_arm_are_those_of_a_bare_loop(kind, integrator):
@@ -85,23 +69,17 @@ def test_rows_of_a_held_arm_are_those_of_a_bare_loop(kind, integrator):
     action = torch.tensor([[0.7], [-0.2], [0.4]], dtype=torch.float64)
     x = robot.simulator.mean(theta, action)
     for row in range(3):
-        model = mujoco.MjModel.from_xml_string(text)
-        model.dof_damping[0] = theta[row, 0]
-        data = mujoco.MjData(model)
-        mujoco.mj_resetDataKeyframe(model, data, 0)
-        data.ctrl[0] = action[row, 0]
-        angles = []
-        for _ in range(251):
-            mujoco.mj_step(model, data)
-            angles.append(float(data.sensordata[0]))
-        assert x[row].tolist() == pytest.approx(angles[25::25], abs=1e-12)
+        given = {"dof_damping": theta[row], "control": action[row]}
+        angles = stepped(text, 251, key=True, **given)[25::25, 0]
+        assert x[row].numpy() == pytest.approx(angles, abs=1e-12)
     assert float((x[0] - x[1]).abs().max()) > 1e-6
 
 
 def test_a_keyframe_gives_controls_and_mocap_poses_too():
     x = held("servo", start="home")
-    assert x == pytest.approx(by_hand(key=True), abs=1e-12)
-    assert held("servo") == pytest.approx(by_hand(key=False), abs=1e-12)
+    for key, own in ((True, x), (False, held("servo"))):
+        angles = stepped(held_arm("servo"), 251, key=key, dof_damping=0.1)[[0, 250], 0]
+        assert own == pytest.approx(angles, abs=1e-12)
     start = {"hinge": 0.7, "hinge velocity": -1.0, "servo control": 0.6}
     start |= {"hand mocap[0]": 0.3, "hand mocap[2]": 0.2}
     assert held("servo", start=start) == pytest.approx(x, abs=1e-12)
@@ -121,15 +99,7 @@ def test_tendons_and_activations_move_as_in_a_bare_loop():
     action = torch.tensor([[0.8], [-0.4]], dtype=torch.float64)
     x = robot.simulator.mean(theta, action).reshape(2, 10, 3)
     for row, (stiffness, time_constant) in enumerate(theta.tolist()):
-        model = mujoco.MjModel.from_xml_string(TENDON)
-        model.tendon_stiffness[0] = stiffness
-        model.actuator_dynprm[0, 0] = time_constant
-        data = mujoco.MjData(model)
-        mujoco.mj_resetDataKeyframe(model, data, 0)
-        data.ctrl[0] = action[row, 0]
-        rows = []
-        for _ in range(501):
-            mujoco.mj_step(model, data)
-            rows.append(data.sensordata.copy())  # of the step's beginning
-        assert x[row].numpy() == pytest.approx(np.array(rows)[50::50], abs=1e-12)
+        given = {"tendon_stiffness": stiffness, "actuator_dynprm": time_constant}
+        rows = stepped(TENDON, 501, key=True, control=action[row], **given)
+        assert x[row].numpy() == pytest.approx(rows[50::50], abs=1e-12)
     assert float((x[0] - x[1]).abs().min()) > 1e-3

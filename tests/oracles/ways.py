@@ -9,6 +9,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -97,9 +98,9 @@ def found(belief: Any) -> Found:
 # --------------------------------------------------------------- beliefs of trials
 
 
-def refined(own: Problem, simulator: SimulatorModel, seed: int) -> Found:
+def refined(own: Problem, simulator: SimulatorModel, seed: int, **sizes: int) -> Found:
     """Return the belief of :func:`.refine`."""
-    settings = RefinementOptions(defensive=DEFENSIVE)
+    settings = RefinementOptions(defensive=DEFENSIVE, **sizes)
     belief = refine(simulator, own.prior, *trials_of(own), settings=settings, seed=seed)
     return found(belief)
 
@@ -132,6 +133,12 @@ SMALL: dict[str, Any] = {
 
 WAYS["refine"] = Way(refined, declared)
 WAYS["refine, noise drawn"] = Way(refined, lambda own: True, is_declared=False)
+#: Too few, so that beliefs are wrong and shall say so.
+WAYS["refine, 200 histories"] = Way(
+    partial(refined, num_histories=200),
+    lambda own: own.closed_form is not None,
+    is_declared=False,
+)
 WAYS["campaign"] = Way(
     in_campaign(
         network="on demand",

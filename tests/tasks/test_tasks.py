@@ -7,19 +7,17 @@ import pytest
 import torch
 from scipy.integrate import solve_ivp
 from torch import Tensor
-from torch.distributions import MultivariateNormal, Normal
+from torch.distributions import MultivariateNormal
 
 from sbi_active import simulate
 from sbi_active.criticism import AugmentedSimulator
 from sbi_active.tasks import get_task  # pyright: ignore
 from sbi_active.tasks.ball_drops import fall  # pyright: ignore
 from sbi_active.tasks.chain import model
-from sbi_active.tasks.location_finding import model as locations
 from sbi_active.tasks.oscillator import reference as reference_module
 from sbi_active.tasks.oscillator.model import (
     ACTION_HIGH,
     ACTION_LOW,
-    ACTIONS,
     NOISE_SD,
     PRIOR_HIGH,
     PRIOR_LOW,
@@ -28,6 +26,8 @@ from sbi_active.tasks.oscillator.model import (
     mean,
 )
 from sbi_active.tasks.oscillator.reference import OscillatorReference
+from tests.oracles.problems import PROBLEMS
+from tests.oracles.reference import answers
 
 
 def test_unknown_task_lists_the_valid_names():
@@ -125,20 +125,6 @@ def test_the_closed_form_solves_the_equations(parameters, moving):
 # Location finding: the model and the task
 
 
-def test_log_likelihood_is_a_normal_s():
-    task = get_task("location_finding")
-    gen = torch.Generator().manual_seed(0)
-    theta, action, x = (
-        torch.randn(30, dim, generator=gen, dtype=torch.float64) for dim in (4, 2, 1)
-    )
-    center = locations.mean(theta, action)
-    expected = Normal(center, locations.NOISE_SD).log_prob(x)[:, 0]
-    torch.testing.assert_close(task.log_likelihood(x, theta, action), expected)
-    mean = task.simulator.mean(theta, action)
-    torch.testing.assert_close(task.simulator.noise.log_prob(x, mean), expected)
-    assert task.exact_likelihood
-
-
 # The oscillator against its differential equation, its reference against itself
 
 
@@ -146,16 +132,6 @@ def uniform(n: int, low: Tensor, high: Tensor, seed: int) -> Tensor:
     generator = torch.Generator().manual_seed(seed)
     u = torch.rand(n, len(low), generator=generator, dtype=torch.float64)
     return low + (high.double() - low.double()) * u
-
-
-def history(num_trials: int, seed: int) -> tuple[Tensor, Tensor]:
-    """Return random actions of the grid and outcomes of a drawn theta."""
-    theta = uniform(1, PRIOR_LOW, PRIOR_HIGH, seed)
-    generator = torch.Generator().manual_seed(1000 + seed)
-    index = torch.randint(len(ACTIONS), (num_trials,), generator=generator)
-    action = ACTIONS[index].double()
-    noise = torch.randn(num_trials, 6, generator=generator, dtype=torch.float64)
-    return action, mean(theta, action) + NOISE_SD * noise
 
 
 # ------------------------------------------------------------------ the model
@@ -185,34 +161,16 @@ def test_mean_solves_the_equation_of_motion():
 # -------------------------------------------------------------- the posterior
 
 
-def evidence_by_prior(action: Tensor, x: Tensor) -> tuple[float, float]:
-    """Log evidence and standard error from draws of the prior."""
-    log_likelihood = []
-    for block in range(3):
-        theta = uniform(100_000, PRIOR_LOW, PRIOR_HIGH, 50 + block)
-        each = (
-            Normal(mean(theta, xi[None]), NOISE_SD).log_prob(row).sum(-1)
-            for xi, row in zip(action, x, strict=True)
-        )
-        log_likelihood.append(sum(each))
-    weight = torch.cat(log_likelihood)
-    top = weight.max()
-    weight = (weight - top).exp()
-    error = weight.std() / weight.mean() / math.sqrt(len(weight))
-    return float(top + weight.mean().log()), float(error)
-
-
-def test_evidence_matches_sampling_from_the_prior():
-    action, x = history(2, seed=1)
+def test_the_reference_has_the_evidence_of_the_oracle():
+    own, known = PROBLEMS["oscillator"](), answers()["oscillator"]
+    action, x = (torch.from_numpy(v) for v in (own.action, own.x))
     posterior = OscillatorReference(action, x)
-    expected, error = evidence_by_prior(action, x)
-    error = math.hypot(error, posterior.log_evidence_se)
+    error = math.hypot(known.error, posterior.log_evidence_se)
     assert error < 0.1
-    assert abs(posterior.log_evidence - expected) < 4 * error
-
+    assert abs(posterior.log_evidence - known.log_evidence) < 4 * error
     # negative control: the check sees a noise that is a tenth too large
     wrong = OscillatorReference(action, x, noise_sd=1.1 * NOISE_SD)
-    assert abs(wrong.log_evidence - expected) > 4 * error
+    assert abs(wrong.log_evidence - known.log_evidence) > 4 * error
 
 
 # ------------------------------------------------------- the information gain

@@ -10,8 +10,7 @@ from attrs import evolve
 from sbi_active import MixtureDensity
 from sbi_active.campaign.learning.methods import METHODS
 from sbi_active.inference import LFIRE
-from tests.campaign.problem import OPTIONS, RATIOS, campaign, noisy
-from tests.campaign.sizes import REFINEMENT
+from tests.campaign.problem import OPTIONS, RATIOS, REFINEMENT, campaign, noisy
 
 DENSITY = MixtureDensity(hidden_features=(16,), num_components=2, num_iterations=150)
 TRAINED = {**dict.fromkeys(("asbi", "nsbi", "alhi", "nlhi"), DENSITY), "seqbed": RATIOS}

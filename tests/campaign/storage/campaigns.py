@@ -12,7 +12,7 @@ from sbi_active import (
     SimulatorModel,
 )
 from sbi_active.campaign.options import CampaignDetails
-from tests.campaign.sizes import REFINEMENT
+from tests.campaign.problem import REFINEMENT
 
 PRIOR = BoxUniform(torch.zeros(2), torch.ones(2))
 ACTIONS = BoxActions([0.5], [2.0], names=["speed"], units=["m/s"])

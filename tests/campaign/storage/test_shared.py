@@ -9,7 +9,7 @@ import torch
 
 from sbi_active import Campaign, GaussianNoise, SimulatorModel
 from sbi_active.campaign.storage.codec import decode, encode
-from sbi_active.simulation.bank import CorruptSegmentError, store
+from sbi_active.simulation.bank import CorruptSegmentError
 from sbi_active.simulation.bank.store import LogChangedError, Store
 from tests.campaign.storage.campaigns import facts, go_on, mean, new
 from tests.simulation.bank.filled import crafted, execute
@@ -199,21 +199,3 @@ def test_crafted_files_are_one_error_that_names_the_file(tmp_path):
             survived += str(error).startswith("expected")
     # What describes and decides nothing may hold anything: a reason, a time.
     assert survived >= 0.9 * len(changes)
-
-
-def test_links_lead_nowhere(tmp_path):
-    mine = tmp_path / "mine.txt"
-    beside = ("store.lock", "store.db-wal", "store.db-shm")
-    for name in (FILE, *beside):
-        mine.write_text("precious")
-        folder = tmp_path / f"c-{name}"
-        with new(folder) as c:
-            c.attach([1.0], number(1))
-        (folder / name).unlink(missing_ok=True)
-        (folder / name).symlink_to(mine)
-        try:
-            with Campaign.load(folder) as c:
-                c.attach([1.0], number(1))
-        except OSError:
-            pass
-        assert mine.read_text() == "precious", name

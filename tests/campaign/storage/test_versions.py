@@ -2,7 +2,6 @@
 
 import json
 import shutil
-import sys
 
 import numpy as np
 import pytest
@@ -162,10 +161,3 @@ def test_a_log_that_ends_within_a_line_is_said(old):
     with pytest.warns(UserWarning, match="ends within line 5, which is left out"):
         assert migrate(old)["log"] == 4
     assert (old / "version-1" / "trials.jsonl").read_bytes() == content[:-20]
-
-
-def test_without_h5py_it_says_what_to_install(old, monkeypatch):
-    monkeypatch.setitem(sys.modules, "h5py", None)
-    with pytest.raises(ImportError, match=r"pip install 'sbi-active\[migrate\]'"):
-        migrate(old)
-    assert not (old / "store.db").exists()

@@ -9,15 +9,8 @@ import torch
 
 from benchmarks.robots.models import SPRING_MASS
 from sbi_active.criticism import Trials
-from sbi_active.criticism.data import Measurements
 from sbi_active.criticism.data.columns import to_si
 from sbi_active.mujoco import from_mjcf
-
-
-def test_ragged_trajectories_are_padded_and_masked():
-    trials = Trials([1.0, 2.0], [np.arange(3.0), np.arange(5.0)])
-    assert trials.x.shape == (2, 5)
-    assert trials.mask.sum(1).tolist() == [3, 5]
 
 
 def test_roles_names_and_places_stay_with_their_trials():
@@ -38,24 +31,6 @@ def test_roles_names_and_places_stay_with_their_trials():
 SPEED, STOP = [1.0, 2.0], [[1.0, 2.0], [3.0, 4.0]]
 NAN = float("nan")
 ROLE = ["fit", "held out"]
-
-
-def test_measurements_skip_gaps_within_a_trajectory_alone():
-    x = torch.tensor([[1.0, torch.nan, 3.0], [4.0, 5.0, 6.0]])
-    trials = Trials([0.0, 1.0], x, sample_times=[0.0, 0.5, 2.0])
-    m = Measurements.of(trials)
-    assert m.x.tolist() == [1, 3, 4, 5, 6]
-    assert m.gap.tolist() == [np.inf, 2.0, np.inf, 0.5, 1.5]
-    assert m.trial.tolist() == [0, 0, 1, 1, 1]
-
-
-def test_measurements_order_channels_before_times():
-    x = torch.arange(12.0).reshape(2, 3, 2)  # trial, time, channel
-    m = Measurements.of(Trials([0.0, 1.0], x, sample_times=[0.0, 1.0, 2.0]))
-    assert m.x[:6].tolist() == [0, 2, 4, 1, 3, 5]
-    assert m.x.tolist() == x.flatten()[m.position].tolist()
-    assert np.isinf(m.gap).sum() == 4
-    assert m.channel[:6].tolist() == [0, 0, 0, 1, 1, 1]
 
 
 @pytest.mark.parametrize(

@@ -1,33 +1,13 @@
 """Generic effects of recordings: which there are, and that a loop finds them."""
 
-import pickle
-
 import pytest
 import torch
 from sbi.utils import BoxUniform
 
 from sbi_active import GaussianNoise, SimulatorModel
-from sbi_active.criticism import Context, Criticism, Trials, generic_effects
+from sbi_active.criticism import Criticism, Trials, generic_effects
 from sbi_active.criticism.effects.changes import delayed_input, played
 from tests.criticism.motor_world import GRID, MODEL, NOISE, PRIOR, measured, speed
-
-
-def test_a_recording_has_an_actuator_and_a_sensor():
-    effects = generic_effects(MODEL, measured(0, {}), prior=PRIOR)
-    names = {hook: {e.name for e in effects if e.hook == hook} for hook in HOOKS}
-    assert len(effects) == sum(map(len, names.values()))
-    assert {"backlash", "dead zone", "input delay", "input lag"} < names["input"]
-    assert {"drift in time", "sensor lag", "sensor quantum"} < names["observation"]
-    x = torch.rand(4, 19).double()
-    context = Context(torch.arange(4), torch.linspace(0, 1, 19).double())
-    for effect in effects:
-        there = pickle.loads(pickle.dumps(effect))
-        if effect.hook == "observation":
-            rows = (x, effect.declared_draws()[:4], x, context)
-            assert torch.equal(there.apply(*rows), effect.apply(*rows))
-
-
-HOOKS = ("input", "observation")
 
 
 def distorted(change):

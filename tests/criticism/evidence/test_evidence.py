@@ -48,16 +48,6 @@ MODELS = {
 }
 
 
-@pytest.mark.parametrize("names", MODELS)
-def test_importance_sampling_gives_the_evidence(names):
-    evidence = rivals().fit(ModelKey(names)).evidence
-    assert evidence.engine == "importance"
-    assert evidence.standard_error < 0.1
-    assert evidence.log_evidence == pytest.approx(
-        MODELS[names], abs=4 * evidence.standard_error
-    )
-
-
 def test_no_parameters_are_simulated_twice():
     sets = rivals()
     rival, scattered = sets.rival(ModelKey()), sets.rival(ModelKey(error="scatter"))
@@ -91,12 +81,6 @@ def test_the_standard_error_claims_what_repeated_runs_show():
     gap = np.array([f.log_evidence for f in found]) - MODELS[()]
     claimed = np.mean([f.standard_error for f in found])
     assert 0.5 * claimed < np.sqrt((gap**2).mean()) < 1.7 * claimed
-
-
-def test_a_likelihood_of_zero_has_no_evidence():
-    none = inferred(log_likelihood=lambda u, floor=0.0: np.full(len(u), -np.inf))
-    assert none.log_evidence == -np.inf
-    assert none.effective_sample_size == 0
 
 
 # A simulator that jumps: what its jumps count as, and evidence beside them

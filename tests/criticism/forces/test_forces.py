@@ -10,7 +10,7 @@ from sbi.utils import BoxUniform
 from sbi_active import GaussianNoise, SimulatorModel
 from sbi_active.criticism import Trials
 from sbi_active.criticism.forces import force_effects, total_force
-from sbi_active.criticism.forces.dictionary import FORMS, FREE
+from sbi_active.criticism.forces.dictionary import FORMS
 from sbi_active.criticism.forces.library import trajectories
 
 TIMES = torch.linspace(0.1, 2.0, 20, dtype=torch.float64)
@@ -62,18 +62,6 @@ def measured(form="", size=0.0, seed=0):
 @pytest.fixture(scope="module")
 def library():
     return force_effects(MODEL, PRIOR, measured(), joints=["hinge"])
-
-
-def test_the_dictionary_covers_position_velocity_time_and_trial(library):
-    assert len(library) == len(FORMS) + len(FREE)
-    families = {e.family for e in library}
-    assert families == {
-        f"force in {what} of hinge" for what in ("q", "v", "q and v", "t", "trial")
-    }
-    assert [e.name for e in library if e.needs_order] == [
-        "trial of hinge",
-        "trial v of hinge",
-    ]
 
 
 def test_phi_of_one_is_a_fifth_of_the_force_of_nominal_motion(library):

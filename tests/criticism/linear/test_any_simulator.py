@@ -103,15 +103,6 @@ def test_heavy_tails_have_the_bayes_factor_of_importance_sampling(bias):
     assert weight.argmin() == 4
 
 
-def test_a_trial_far_off_in_heavy_tails_moves_no_fit():
-    x = measured()
-    x[4] += 5.0
-    model = SimulatorModel(curve, noise=StudentTNoise(SD, 3.0))
-    u = verdict_of(model, x).search.model(BARE).u
-    clean = verdict_of(model, measured()).search.model(BARE).u
-    assert u == pytest.approx(clean, abs=0.15)
-
-
 def test_which_trials_have_an_outcome_tells_of_parameters_and_effects():
     """A response that ends at a height; where it should not, none has one."""
 

@@ -103,13 +103,6 @@ def test_what_helps_and_what_is_named(case):
         assert found.named == (*named,)
 
 
-def test_a_t_test_alone_would_be_wrong():
-    assert FAR.mean() > 2 * EVEN.mean()
-    assert predicts_better(EVEN, FAR) < 0.9
-    assert predicts_better(TEN[:4], ONCE) < 0.8
-    assert predicts_better(TEN, ONE) < predicts_better(TEN, UNEVEN) < 0.8
-
-
 def test_support_is_of_the_fit_and_needs_no_other_effects():
     own = choice(HALVED).support["a"]
     assert own.remains == pytest.approx(0.1)  # of the fit, not of left-out trials

@@ -191,27 +191,6 @@ def test_a_formula_that_does_better_leaves_an_imitation_unnamed():
     assert report.guess == "|xi|^1.5"
 
 
-def test_several_effects_are_asked_what_left_out_trials_say_of_them():
-    found = loop(trials(quadratic=QUADRATIC, step=1.0))
-    tracing = found.trace()
-    assert tracing.verdict == "quadratic + step"
-    assert found.misfit() is not None
-    assert {*tracing.misfit.named} == {*tracing.chosen}
-    draws = tracing.evidences["quadratic"].draws  # without the step, which matters
-    mean, sd = draws.mean(0), draws.std(0)
-    assert (abs(mean - (*THETA, QUADRATIC)) < 2 * sd).all()
-
-
-def test_a_model_that_one_effect_refutes_has_intervals_that_know_of_it():
-    tracing = loop(trials(quadratic=QUADRATIC)).trace()
-    assert tracing.verdict == "quadratic"
-    assert tracing.misfit is None
-    draws = tracing.evidences["none"].draws
-    mean, sd = draws.mean(0), draws.std(0)
-    assert abs(mean[0] - THETA[0]) > 10 * SCALE  # the quadratic's mean is in it
-    assert (abs(mean - THETA) < 2 * sd).all()
-
-
 def test_held_out_errors_are_told_number_by_number_as_left_out_ones_are():
     """Two numbers in units of their own: their errors have no common size."""
     unit, gen = torch.tensor([1.0, 100.0]), torch.Generator().manual_seed(3)

@@ -7,7 +7,6 @@ import pytest
 import torch
 from sbi.utils import BoxUniform
 from scipy.stats import entropy
-from torch.distributions import Normal
 
 from sbi_active import DiscreteActions, GaussianNoise, SimulatorModel
 from sbi_active.criticism import Criticism, Trials
@@ -18,7 +17,6 @@ from sbi_active.criticism.next_trial.next_action import (
     choose_action,
 )
 from sbi_active.criticism.results import ModelKey
-from sbi_active.design.estimators.model_index import ModelIndexGain, RivalSampler
 from tests.criticism.misfit.oscillator import ACTION, EFFECTS, trials
 from tests.criticism.misfit.oscillator import MODEL as OSCILLATOR
 from tests.criticism.misfit.oscillator import PRIOR as RATES
@@ -69,28 +67,6 @@ def test_rivals_predict_their_posterior_predictive():
     sd = NOISE * (1 + 2.5**2 / square) ** 0.5
     assert float(x.mean()) == pytest.approx(2.5 * slope, abs=5 * sd / 4_000**0.5)
     assert float(x.std()) == pytest.approx(sd, rel=5 / 8_000**0.5 + 0.02)
-
-
-def test_the_gain_is_that_of_two_known_densities():
-    """Bias free against none, at two actions, beside a numerical integral."""
-    c = criticism([1.0, 2.0, 3.0, 2.0], [0.7, 1.4, 2.1, 1.4], [BIAS], BOTH)
-    c.trace()
-    names = ("none", "bias")
-    candidates = BOTH.values[[0, 3]]
-    rivals = [PredictedRival(c.rivals, ModelKey.of(n), 0.5, candidates) for n in names]
-    sampler = RivalSampler(rivals, 0)
-    simulations = sampler.draw(1_000, candidates)
-    gain = ModelIndexGain(sampler.probability)(None, simulations, None)
-    for a, rows in enumerate(gain):
-        draws = [r.predict(candidates[a], 10_000, 9)[:, 0].double() for r in rivals]
-        grid = torch.linspace(-15, 15, 20_001).double()
-        p = [Normal(d.mean(), d.std()).log_prob(grid).exp() for d in draws]
-        middle = (p[0] + p[1]) / 2
-        exact = sum(0.5 * q * (q / middle).log().nan_to_num(0, 0, 0) for q in p)
-        exact = float(torch.trapezoid(exact, grid))
-        error = float(rows.std()) / len(rows) ** 0.5
-        assert float(rows.mean()) < exact + 4 * error + 0.01
-        assert float(rows.mean()) > 0.8 * exact - 4 * error - 0.03
 
 
 def test_the_other_way_separates_a_tilt():

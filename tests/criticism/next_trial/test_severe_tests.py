@@ -105,21 +105,3 @@ def test_only_a_verdict_that_names_effects_is_tested_and_within_the_range():
     assert tests == ()
     _, [only] = line(1.0, forward)
     assert only.is_permitted
-
-
-def test_the_difference_is_that_of_two_predictions():
-    c, [inside, beyond] = line(1.0)
-    assert c.trace().verdict == "bias"
-    again = severe_tests(c.rivals, c.trace(), SPEEDS)
-    assert [t.difference for t in again] == [inside.difference, beyond.difference]
-    assert bool(SPEEDS.contains(torch.tensor(inside.action).float()))
-    assert beyond.action.tolist() in ([0.0], [-0.0], [4.0])
-    # Least squares in slope and bias, and in the slope alone, far from the trials.
-    t = c.trials
-    design = torch.stack([t.action[:, 0], torch.ones(5)], 1).double()
-    full = torch.linalg.lstsq(design, t.x).solution[:, 0]
-    at = torch.tensor([float(beyond.action[0]), 1.0]).double()
-    sd = 0.1 * float(1 + at @ torch.linalg.inv(design.T @ design) @ at) ** 0.5
-    slope = float((t.action * t.x).sum() / (t.action**2).sum())
-    least = abs(float(full @ at) - slope * float(at[0])) / sd
-    assert beyond.difference > 0.8 * least

@@ -3,7 +3,6 @@
 import json
 import pickle
 import re
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -19,11 +18,8 @@ from sbi_active.criticism.report.figures import (
     plot_residuals,
 )
 from sbi_active.criticism.report.sections import head
-from tests.criticism.report.reports import DRAG, flat, report, residuals, tracing
+from tests.criticism.report.reports import DRAG, report, residuals, tracing
 from tests.display.parsed import Parsed
-
-NONE = {"tracing": tracing("none"), "residuals_after": None}
-
 
 TESTS = (SevereTest(action=np.array([3.0]), is_permitted=True, difference=1.234),)
 
@@ -34,35 +30,6 @@ def test_a_dictionary_has_no_probabilities_where_they_contradict_the_verdict():
     assert plain["misfit"] is None
     withdrawn = report(tracing=tracing("unexplained", instead_of="drag")).to_dict()
     assert withdrawn["probabilities"] is withdrawn["credible_set"] is None
-
-
-LIKELIER = {
-    "probabilities": {"scatter": 0.11, "tilt": 0.46, "drag": 0.43},
-    "credible_set": ("tilt", "drag"),
-}
-ONE_LEFT = replace(report().next_action, action=None)
-FEW_DRAWS = tuple(replace(e, effective_sample_size=49.0) for e in tracing().estimates)
-
-
-@pytest.mark.parametrize(
-    ("changes", "words"),
-    [
-        ({"next_action": ONE_LEFT, **NONE}, "Stop: no permitted action"),
-        (
-            {"next_action": replace(ONE_LEFT, separates=("none",)), **NONE},
-            "Stop: of the",
-        ),
-        ({"next_action": replace(ONE_LEFT, separates=("drag",))}, "only drag is left"),
-        (
-            {"tracing": tracing("scatter", **LIKELIER)},
-            "though tilt is likelier (P = 0.46)",
-        ),
-        ({"tracing": tracing(estimates=FEW_DRAWS)}, "about 0.12 1/m"),
-    ],
-)
-def test_what_is_said_of_a_case_and_of_no_other(changes, words):
-    assert words in flat(report(**changes))
-    assert words not in flat(report())
 
 
 def test_a_report_goes_through_json_with_all_sections():

@@ -6,7 +6,7 @@ import torch
 from sbi.utils import BoxUniform
 from torch.distributions import Independent, LogNormal, Normal
 
-from sbi_active.criticism.rivals.coordinates import WIDE, SearchCoordinates
+from sbi_active.criticism.rivals.coordinates import SearchCoordinates
 from tests.effects import effect, half, normal
 
 BOX = BoxUniform(torch.tensor([1.0]), torch.tensor([3.0]))
@@ -27,15 +27,6 @@ def test_the_density_is_the_prior_s_times_the_jacobian():
     # dz / du is b, and b z where z is searched in logs.
     expected = expected + np.log(c.scale).sum() + z[:, 1].log()
     assert c.log_prob(u) == pytest.approx(expected.numpy(), abs=1e-5)
-
-
-def test_only_a_positive_number_of_wide_prior_is_searched_in_logs():
-    assert coordinates().is_log.tolist() == [False, True, *[False] * 6]
-    # 5 % to 95 % of a log-normal of deviation s span exp(3.29 s).
-    for factor, is_log in ((0.9, False), (1.1, True)):
-        sd = torch.tensor([factor * np.log(WIDE) / 3.29])
-        one = effect("one", prior=LogNormal(torch.zeros(1), sd))
-        assert SearchCoordinates(BOX, [one], (), 1).is_log[1] == is_log
 
 
 def test_bounds_stay_bounds_and_count_as_within():

@@ -6,7 +6,7 @@ import torch
 from scipy import stats
 from scipy.stats import multivariate_normal
 
-from sbi_active import AutocorrelatedNoise, GaussianNoise, StudentTNoise, estimate_noise
+from sbi_active import AutocorrelatedNoise, GaussianNoise, estimate_noise
 from sbi_active.criticism import Trials
 from sbi_active.criticism.data.measurements import Measurements
 from sbi_active.criticism.rivals.noise_grid import (
@@ -59,13 +59,6 @@ def test_each_channel_has_its_own_deviation():
     for wrong, message in ((sd[:2], "for each of 3 channels; got 2"), (0.0, "noise")):
         with pytest.raises(ValueError, match=message):
             declared_noise(GaussianNoise(wrong), m)
-
-
-def test_t_noise_has_the_deviation_that_was_declared():
-    m = Measurements.of(Trials([0.0, 1.0], [0.3, -4.0]))
-    law = stats.t(3, scale=0.5 / np.sqrt(3))
-    expected = law.logpdf([0.3, -4.0]).sum()
-    assert log_likelihood(StudentTNoise(0.5, df=3.0), m) == pytest.approx(expected)
 
 
 def test_unknown_size_and_correlation_are_summed_on_their_grid():

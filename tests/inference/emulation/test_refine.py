@@ -167,17 +167,6 @@ def test_a_constant_channel_does_no_harm():
     assert belief.diagnostics.trustworthy, belief.diagnostics.warnings
 
 
-def test_deterministic_simulator_is_refused():
-    with pytest.raises(ValueError, match="expected a simulator with noise"):
-        refine(
-            lambda theta, action: theta[:, :1] * action,
-            BOX,
-            torch.ones(1, 1),
-            torch.ones(1, 1),
-            seed=0,
-        )
-
-
 def test_a_lack_of_memory_is_said(monkeypatch):
     def lacking(*_):
         raise RuntimeError("DefaultCPUAllocator: can't allocate memory: you tried")

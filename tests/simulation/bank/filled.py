@@ -36,11 +36,6 @@ def fill(bank, seeds=(0, 1, 2, 3), num=5):
         append(bank.drawn_from(prior()), rows, seed)
 
 
-def appended(folder):
-    with Bank(folder, simulator=simulator) as bank:
-        fill(bank, (9,))
-
-
 def filled(path):
     """Return the folder of a bank with four segments of five rows."""
     with Bank(path, simulator=simulator) as bank:

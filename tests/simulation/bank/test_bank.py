@@ -59,20 +59,6 @@ def test_what_is_stored_is_not_simulated_again(tmp_path):
         assert sum(calls) == 300
 
 
-def test_part_of_a_run_is_completed(bank):
-    theta, action = draw(300)
-    whole = simulate(simulator, theta, action, seed=0)
-    with_store = simulate(simulator, theta, action, seed=0, store=bank)
-    run = bank._segments()[0][1]
-    other = Bank(bank.path.parent / "other", simulator=simulator)
-    some = torch.arange(0, 300, 7)
-    rows = {k: getattr(whole, k)[some] for k in ("theta", "action", "x", "status")}
-    other.save(run, index=some, **rows, seed=0)
-    assert same(simulate(simulator, theta, action, seed=0, store=other), with_store)
-    assert len(other) == 300
-    assert sorted(other.load(run)[0].tolist()) == list(range(300))
-
-
 def test_rows_by_position_slice_and_mask(bank, monkeypatch):
     monkeypatch.setattr(module, "SEGMENT_BYTES", 45 * 60)  # about 60 rows a segment
     rows = simulate(simulator, *draw(200), seed=0)
@@ -116,17 +102,6 @@ def test_several_banks_in_one_file(tmp_path):
     assert [len(Bank(tmp_path, name=name)) for name in "ab"] == [4, 3]
     with pytest.raises(ValueError, match="expected the bank rows in .* bank a, bank b"):
         Bank(tmp_path)
-
-
-def test_second_writer_is_told_who_writes_and_readers_go_on(bank):
-    simulate(simulator, *draw(10), seed=0, store=bank)
-    second = Bank(bank.path, simulator=simulator)
-    with pytest.raises(LockedError, match="expected no other writer"):
-        append(second, SOME, 0)
-    assert len(Bank(bank.path).read()) == 10
-    bank.close()
-    append(second, SOME, 0)
-    second.close()
 
 
 def test_readers_go_on_while_another_process_writes(bank):

@@ -3,7 +3,6 @@
 import json
 import os
 from contextlib import suppress
-from typing import Any
 
 import numpy as np
 import pytest
@@ -34,13 +33,18 @@ HEADERS = {
     "deep in simulator": b'{"simulator": ' + b'{"a":' * 500 + b"1",
     "bytes": bytes(range(256)),
     "infinite": b'{"created": Infinity}',
+    "no shapes": {},
+    **{f"shapes {s}": {"shapes": s} for s in (-1, [1.5], [[[]]], {"theta": 3})},
 }
 
 
 @pytest.mark.parametrize("content", HEADERS.values(), ids=HEADERS.keys())
 def test_crafted_headers(folder, content):
+    if not isinstance(content, bytes):
+        header = Bank(folder).header
+        content = {k: v for k, v in header.items() if k != "shapes"} | content
     crafted(folder, "bank rows", 0, content)
-    with pytest.raises(CorruptSegmentError, match=r"store\.db as it was written"):
+    with pytest.raises(CorruptSegmentError, match=r"store\.db"):
         Bank(folder)
 
 
@@ -58,16 +62,6 @@ def test_files_that_are_no_store(folder, make):
     for options in ({}, {"simulator": simulator}):
         with pytest.raises((CorruptSegmentError, ValueError), match=r"store\.db"):
             Bank(folder, **options)
-
-
-@pytest.mark.parametrize("shapes", [-1, [1.5], [[[]]], {"theta": 3}, "lost"])
-def test_shapes_of_other_types(folder, shapes):
-    header = {**Bank(folder).header, "shapes": shapes}
-    if shapes == "lost":
-        del header["shapes"]
-    crafted(folder, "bank rows", 0, header)
-    with pytest.raises(CorruptSegmentError, match=r"store\.db"):
-        Bank(folder)
 
 
 KNOWN = {"run": "r", "seed": 1}
@@ -199,7 +193,7 @@ def test_the_log_of_another_file_is_noticed(folder, tmp_path):
         Bank(folder).read()
 
 
-def test_numbers_that_float32_cannot_hold(folder):
+def test_numbers_that_float32_cannot_hold_and_seeds_beyond_int64(folder):
     rows = torch.ones(3, 2)
     with Bank(folder, simulator=simulator) as bank:
         large = Simulations(rows, rows[:, :1], rows.double() * 1e39)
@@ -207,13 +201,6 @@ def test_numbers_that_float32_cannot_hold(folder):
             append(bank, large, 0)
         with pytest.raises(ValueError, match=r"x of real numbers; got torch.complex64"):
             append(bank, Simulations(rows, rows[:, :1], rows + 1j, torch.zeros(3)), 0)
-        eight: Any = np.int64(8)
-        assert append(bank, Simulations(rows, rows[:, :1], rows), eight) == 3
-    assert len(Bank(folder)) == 23
-
-
-def test_seeds_beyond_int64_are_stored(folder):
-    rows = torch.ones(3, 2)
-    with Bank(folder, simulator=simulator) as bank:
-        assert append(bank, Simulations(rows, rows[:, :1], rows), 2**70) == 3
-    assert len(Bank(folder).read()) == 23
+        for seed in (np.int64(8), 2**70):
+            assert append(bank, Simulations(rows, rows[:, :1], rows), seed) == 3
+    assert len(Bank(folder)) == 26

@@ -123,20 +123,3 @@ def test_sizes_that_are_unknown_by_channel_are_summed_channel_by_channel():
     draws = noise.posterior.sample((200,))
     for column, (low, high) in zip(draws.T, bounds, strict=False):
         assert low <= column.min() < 2 * low < high / 2 < column.max() <= high
-
-
-def test_one_size_that_is_unknown_is_summed_over_its_grid():
-    noise = AutocorrelatedNoise.unknown(
-        sd=(0.1, 1.0), correlation_time=(0.05, 2.0), num_sds=5, num_times=3
-    )
-    gen = torch.Generator().manual_seed(0)
-    x, mean = torch.randn(2, 6, 2, generator=gen).double(), torch.zeros(2, 6, 2)
-    x[1, 2, 1] = torch.nan
-    nodes = [
-        low * (high / low) ** ((torch.arange(num) + 0.5) / num)
-        for (low, high), num in (((0.1, 1.0), 5), ((0.05, 2.0), 3))
-    ]
-    laws = [AutocorrelatedNoise(*p) for p in torch.cartesian_prod(*nodes)]
-    each = [law.log_prob(x, mean) for law in laws]
-    expected = torch.stack(each).logsumexp(0) - np.log(15)
-    assert torch.allclose(noise.log_prob(x, mean), expected)

@@ -10,15 +10,13 @@ from collections import Counter
 
 import cloudpickle
 import joblib
-import numpy as np
 import pytest
 import torch
 
 from sbi_active import simulate
 from sbi_active.seeding import row_normals
 from sbi_active.simulation import MissingRowsWarning
-from sbi_active.simulation.workers.pools import DaskPool, ask_child, pickled
-from sbi_active.simulation.workers.schedule import Schedule
+from sbi_active.simulation.workers.pools import DaskPool
 from sbi_active.simulation.workers.settings import Workers
 
 dask = pytest.importorskip("dask")
@@ -173,21 +171,3 @@ def test_workers_that_the_cluster_gave_up_are_asked_for_again(rows, monkeypatch)
     texts = [str(warning.message) for warning in said]
     assert any("no workers at inproc://" in text for text in texts)
     assert torch.equal(results[0].x, simulate(seeded, theta, action, seed=0).x)
-
-
-def risky(theta, action):
-    if bool((action == 3).any()):
-        os.kill(os.getpid(), signal.SIGKILL)
-    if bool((action == 2).any()):
-        raise RuntimeError("no")
-    return theta + action
-
-
-def test_rows_at_risk_run_in_a_child():
-    theta, action = torch.rand(5, 1), torch.tensor([1.0, 2.0, 3.0, 2.0, 1.0])[:, None]
-    schedule = Schedule(risky, theta, action, 0)
-    calls = [schedule._call(np.array([i]), "row") for i in range(5)]
-    replies = [ask_child(pickled(risky), call, None) for call in calls]
-    faults = [reply.fault for reply in replies]
-    assert faults == [None, "raised", "worker died", "raised", None]
-    assert torch.equal(replies[0].x, theta[[0]] + action[[0]])

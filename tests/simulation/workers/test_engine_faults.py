@@ -1,6 +1,7 @@
 """Rows that raise, hang, kill their process or give no numbers."""
 
 import os
+import re
 import signal
 import sys
 import time
@@ -95,20 +96,6 @@ def test_faults_cost_their_rows_alone():
     check_faults(200, num_workers=2, time_limit=1.0, killer=40)
 
 
-def test_a_batch_that_raises_is_divided_here_too():
-    def simulator(theta, action, seeds):
-        if (theta == 5).any() or (theta == 70).any():
-            raise ValueError("no")
-        return seeded(theta, action, seeds)
-
-    rows = index_rows(100)
-    clean = simulate(seeded, *rows, seed=0).x
-    some = quietly(simulator, *rows, seed=0)
-    assert some.tracebacks.keys() == {5, 70}
-    assert some.counts == {"ok": 98, "invalid": 0, "missing": 2}
-    assert torch.equal(some.x[some.valid], clean[some.valid])
-
-
 def test_infinite_rows_are_invalid_and_partial_ones_are_masked():
     def simulator(theta, action, seeds):
         x = theta.repeat(1, 2)
@@ -177,16 +164,6 @@ def test_missing_rows_are_tried_again(tmp_path):
     assert torch.equal(twice.x, clean)
 
 
-def test_the_exit_code_is_told():
-    def simulator(theta, action, seeds):
-        if (theta == 1).any():
-            os._exit(3)
-        return theta
-
-    rows = quietly(simulator, *index_rows(3), seed=0, workers=2)
-    assert "ended with code 3 during the call" in rows.tracebacks[1]
-
-
 @pytest.mark.parametrize("num_workers", [1, 2])
 @pytest.mark.parametrize("n", [1, 2_000])
 def test_a_simulator_that_always_raises_is_an_error(n, num_workers):
@@ -238,40 +215,48 @@ class Stop(BaseException):
     """What except Exception does not see."""
 
 
-def test_whatever_is_raised_in_a_worker_has_its_traceback():
+def raising():
+    raise Stop("the reason")
+
+
+@pytest.mark.parametrize(
+    ("end", "text"),
+    [
+        (raising, r"(?s)in simulator.*the reason\s*$"),
+        (lambda: os._exit(3), "ended with code 3 during the call"),
+    ],
+)
+def test_whatever_ends_a_call_in_a_worker_is_told(end, text):
     def simulator(theta, action, seeds):
         if (theta == 1).any():
-            raise Stop("the reason")
+            end()
         return seeded(theta, action, seeds)
 
     rows = quietly(simulator, *index_rows(8), seed=0, workers=2)
     assert rows.tracebacks.keys() == {1}
-    assert "in simulator" in rows.tracebacks[1]
-    assert rows.tracebacks[1].strip().endswith("the reason")
+    assert re.search(text, rows.tracebacks[1])
     expected = simulate(seeded, *index_rows(8), seed=0).x
     assert torch.equal(rows.x[rows.valid], expected[rows.valid])
 
 
-def test_whatever_ends_the_loading_has_its_traceback():
-    def setup():
-        raise Stop("no licence")
-
-    def fn(theta, action, *, context):
-        return theta
-
-    model = SimulatorModel(fn, setup=setup)
-    with pytest.raises(SimulationError, match=r"(?s)can load; got.*no licence"):
-        simulate(model, *index_rows(3), seed=0, workers=2)
+def ending():
+    raise Stop("no licence")
 
 
-def test_loading_has_a_limit_where_rows_have_one(monkeypatch):
-    def setup():
-        time.sleep(60)
-
+@pytest.mark.parametrize(
+    ("setup", "text"),
+    [
+        (ending, r"(?s)can load; got.*no licence"),
+        (lambda: time.sleep(60), "no answer within 0.5 s"),
+    ],
+)
+def test_a_simulator_that_does_not_load_is_an_error_that_says_why(
+    setup, text, monkeypatch
+):
     def fn(theta, action, *, context):
         return theta
 
     monkeypatch.setattr(Worker, "LOADING", 0.5)
-    model = SimulatorModel(fn, setup=setup)
-    with pytest.raises(SimulationError, match="no answer within 0.5 s"):
-        simulate(model, *index_rows(3), seed=0, workers=Workers(time_limit=0.1))
+    model, limited = SimulatorModel(fn, setup=setup), Workers(2, time_limit=0.1)
+    with pytest.raises(SimulationError, match=text):
+        simulate(model, *index_rows(3), seed=0, workers=limited)

@@ -62,37 +62,30 @@ def sizes_of(seconds, num_rows, pace):
     sizes = []
     while num_rows:
         sizes.append(pace.size(num_rows))
-        pace.observe(sizes[-1], seconds(sizes[-1]))
+        pace.observe(sizes[-1], seconds(sizes[-1], len(sizes) - 1))
         num_rows -= sizes[-1]
     return sizes
 
 
-def test_slow_rows_are_cut_into_parts_of_a_second():
-    sizes = sizes_of(lambda n: 0.01 * n, 2_000, Pace())
-    assert sizes[0] == 2
-    assert max(sizes) <= 150
-    assert len(sizes) <= 25
-    sizes = sizes_of(lambda n: 1.0 * n, 30, Pace())
-    assert max(sizes) <= 4
+#: Seconds of a call by its rows and its place, rows, the most a call has, and calls.
+PACES = {
+    "slow rows": (lambda n, call: 0.01 * n, 2_000, 150, 25),
+    "a second a row": (lambda n, call: 1.0 * n, 30, 4, 30),
+    "a slow first call": (lambda n, call: 0.01 * n + 3 * (call == 0), 2_000, 150, 30),
+    "as slow for few": (lambda n, call: 0.05 + 1e-7 * n, 5_000, 5_000, 5),
+    "as slow for few, dear": (lambda n, call: 3.0 + 1e-7 * n, 5_000, 5_000, 5),
+}
 
 
-@pytest.mark.parametrize("seconds", [0.05, 3.0])
-def test_a_simulator_as_slow_for_few_rows_is_hardly_cut(seconds):
+@pytest.mark.parametrize("case", PACES)
+def test_calls_take_about_a_second(case):
+    seconds, num_rows, most, num_calls = PACES[case]
     pace = Pace()
-    assert len(sizes_of(lambda n: seconds + 1e-7 * n, 5_000, pace)) <= 5
-    assert sizes_of(lambda n: seconds + 1e-7 * n, 5_000, pace) == [5_000]
-
-
-def test_a_slow_first_call_is_not_taken_for_the_pace():
-    calls = []
-
-    def seconds(n):
-        calls.append(n)
-        return 0.01 * n + (3.0 if len(calls) == 1 else 0.0)
-
-    sizes = sizes_of(seconds, 2_000, Pace())
-    assert max(sizes) <= 150
-    assert len(sizes) <= 30
+    sizes = sizes_of(seconds, num_rows, pace)
+    assert max(sizes) <= most
+    assert len(sizes) <= num_calls
+    if most == num_rows:  # known by now
+        assert sizes_of(seconds, num_rows, pace) == [num_rows]
 
 
 def test_a_simulator_is_timed_once(monkeypatch):

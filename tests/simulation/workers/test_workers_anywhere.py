@@ -31,7 +31,7 @@ go()
 FORKED = """
 child = os.fork()
 if child == 0:
-    go(1.0)
+    go()
     raise SystemExit(0)
 assert os.waitpid(child, 0)[1] == 0
 go()
