@@ -9,7 +9,7 @@ import torch
 
 from sbi_active import Campaign, GaussianNoise, SimulatorModel
 from sbi_active.campaign.storage.codec import decode, encode
-from sbi_active.simulation.bank import CorruptSegmentError
+from sbi_active.simulation.bank import CorruptSegmentError, store
 from sbi_active.simulation.bank.store import LogChangedError, Store
 from tests.campaign.storage.campaigns import facts, go_on, mean, new
 from tests.simulation.bank.filled import crafted, execute
