@@ -15,7 +15,8 @@ from sbi_active.criticism.data.measurements import Measurements
 from sbi_active.criticism.data.trials import Trials
 from sbi_active.criticism.effects.augmented import AugmentedSimulator
 from sbi_active.criticism.effects.effect import Effect
-from sbi_active.criticism.identification.posterior import TINY, Draws, Sampler, Unknowns
+from sbi_active.criticism.identification.channels import TINY, ChannelErrors
+from sbi_active.criticism.identification.posterior import Draws, Posterior
 from sbi_active.criticism.identification.settings import IdentifySettings
 from sbi_active.criticism.linear.fits import best_fit, polished
 from sbi_active.criticism.linear.model import (
@@ -34,6 +35,10 @@ from sbi_active.criticism.rivals.trial_simulator import TrialSimulator
 from sbi_active.inference.sampling.least_squares import basis_of
 from sbi_active.simulation import SimulatorModel
 
+#: Deviation of the Gaussian that stands for a flat prior, in units of its range: it
+#: leaves the prior as it is, and directions that nothing tells solvable.
+FLAT = 100.0
+
 
 @dataclass(frozen=True)
 class Linear:
@@ -44,18 +49,18 @@ class Linear:
         effect: Number of the effect that a coordinate belongs to, -1 for none, (d,).
         null: Values at which effects vanish, shape (d,); NaN for other coordinates.
         unit: Root mean square residual of each number's channel, shape (N,).
-        model: Linear model, in units.
+        fit: Linear model, in units, where it was fitted.
     """
 
     rival: Rival
     effect: NDArray[np.int64]
     null: Array
     unit: Array
-    model: LinearModel
+    fit: LinearModel
 
     def around(
         self,
-        model: LinearModel,
+        fit: LinearModel,
         free: NDArray[np.bool_],
         unit: Array,
         tried: float | None = None,
@@ -63,58 +68,53 @@ class Linear:
         """Return the linear model around a fit of some of the effects.
 
         Args:
-            model: Linear model in units, without the others.
+            fit: Linear model in units, without the others.
             free: Coordinates of that model, shape (d,).
             unit: Units of the residuals, shape (N,).
             tried: Deviations of the prior by which the others are tried anew: by a
                 chord, since many are flat at their null.
         """
         at = np.array(self.null)
-        at[free] = model.u
+        at[free] = fit.u
         if tried is None:
-            columns = self.model.jacobian[:, ~free]
+            columns = self.fit.jacobian[:, ~free]
         else:
-            columns = chords(self.rival, at, ~free, tried, model, unit)
-        full = enlarged(model, self.rival, ~free, at[~free], columns)
-        return replace(self, unit=unit, model=full)
+            columns = chords(self.rival, at, ~free, tried, fit, unit)
+        full = enlarged(fit, self.rival, ~free, at[~free], columns)
+        return replace(self, unit=unit, fit=full)
 
-    def of(self, rival: Rival, bare: LinearModel) -> Linear:
-        """Return the linear model with some of its effects.
+    def without(self, kept: NDArray[np.bool_]) -> Linear:
+        """Return the linear model without some of its effects.
 
         Args:
-            rival: Rival with those effects.
-            bare: Linear model in units, without any.
+            kept: Mask of those that it keeps, shape (e,).
         """
-        kept = [e in rival.effects for e in self.rival.effects]
         at = np.append(kept, True)[self.effect]
-        effect, null = (
-            np.append(np.cumsum(kept) - 1, -1)[self.effect[at]],
-            self.null[at],
+        effects = [e for e, keep in zip(self.rival.effects, kept, strict=True) if keep]
+        number = np.append(np.cumsum(kept) - 1, -1)
+        return replace(
+            self,
+            rival=with_effects(self.rival, effects),
+            effect=number[self.effect[at]],
+            null=self.null[at],
+            fit=self.fit.part(at),
         )
-        new = effect >= 0
-        columns = self.model.jacobian[:, at][:, new]
-        model = enlarged(bare, rival, new, null[new], columns)
-        return replace(self, rival=rival, effect=effect, null=null, model=model)
 
     @property
     def origin(self) -> Array:
         """Point of linearization, with effects at their null, shape (d,)."""
-        return np.where(self.effect < 0, self.model.u, self.null)
+        return np.where(self.effect < 0, self.fit.u, self.null)
 
     @property
-    def rows(self) -> Array:
-        """Residual at the origin and its derivatives, in units, shape (N, 1 + d)."""
-        j = self.model.jacobian
-        r = self.model.residual + j @ (self.origin - self.model.u)
-        return np.concatenate([r[:, None], j], 1)
+    def model(self) -> LinearModel:
+        """The linear model at the origin, from which coordinates count.
 
-    @property
-    def unknowns(self) -> Unknowns:
-        """Prior knowledge of u - ``origin``."""
-        c, at = self.rival.coordinates, self.origin
-        is_flat = (self.effect >= 0) & (c.precision == 0)
-        precision = np.where(is_flat, 1.0, c.precision)
-        return Unknowns(c.low - at, c.high - at, c.center - at, precision, self.effect)
+        Its prior between two bounds is flat there, but for effects.
+        """
+        fit, origin = self.fit, self.origin
+        model = replace(fit, u=origin, residual=fit.at(origin[None])[0]).from_here()
+        is_flat = (self.effect < 0) & (self.rival.coordinates.precision == 0)
+        return replace(model, sd=np.where(is_flat, FLAT * (fit.high - fit.low), fit.sd))
 
     @property
     def sizes(self) -> Array:
@@ -181,43 +181,62 @@ def fitted(
     """
     own, rng = settings, np.random.default_rng(seed)
     bare = _bare(model, prior, trials, beside, own, seed)
-    doubtful = [e for e in beside if e.scope == "campaign"]
     fit, unit = _searched(bare, own, seed)
-    linear = _beside(_with(bare, doubtful), fit, unit, own)
-    told, aliases = _told(linear, own.alias)
-    if len(told) < len(doubtful):
-        doubtful = told
-        linear = linear.of(_with(bare, told), fit)
+    doubtful = [e for e in beside if e.scope == "campaign"]
+    linear, aliases = _beside(with_effects(bare, doubtful), fit, unit, own)
     m, c = linear.measurements, linear.rival.coordinates
     share = 1.0 if known_sd is None else ((known_sd[m.channel] / unit) ** 2).min()
     errors = own.errors(m, float(share))
     filters = Filters(errors, m, 0 * m.trial, m.channel)
-    there, some = np.zeros(len(doubtful), dtype=bool), bare
+    there, some = np.zeros(len(linear.rival.effects), dtype=bool), bare
     for again in range(own.linearized):
-        known: list[float | None] = [None] * filters.num_groups
-        if known_sd is not None:
-            known = [*(known_sd / linear.sizes)]
-        given = filters.grams(linear.rows), errors, linear.unknowns, known, rng
-        sampler = Sampler(*given, own.sampler)
-        draws = sampler.draws(own.sampler.few)
+        known = None if known_sd is None else known_sd / linear.sizes
+        posterior = _posterior(linear, filters, known, own, rng)
+        draws = posterior.draws(own.num_draws, rng)
         before, there = there, draws.present.mean(0) > own.likely
         free = np.append(there, True)[linear.effect]
         u = linear.origin + np.where(free, draws.u.mean(0), 0.0)
         u, is_new = np.clip(u, c.low, c.high), bool((there != before).any())
-        move = np.abs(u - linear.model.u) / (draws.u.std(0) + own.step)
+        move = np.abs(u - linear.fit.u) / (draws.u.std(0) + own.step)
         is_near = not is_new and move.max() < own.moved
         if is_near or again == own.linearized - 1:
             break
         if is_new:
-            some = _with(bare, [e for e, k in zip(doubtful, there, strict=True) if k])
+            effects = zip(linear.rival.effects, there, strict=True)
+            some = with_effects(bare, [e for e, keep in effects if keep])
             fit, unit = _settled(some, u[free], linear.unit, own)
             linear = linear.around(fit, free, unit, own.tried)
         else:
             fit = linearize(some, u[free], linear.unit)
             fit = centered(some, fit, linear.unit)
             linear = linear.around(fit, free, linear.unit)
-    draws = sampler.draws(own.sampler.many)
     return Fitted(**vars(linear), errors=errors, draws=draws, aliases=aliases)
+
+
+def _posterior(
+    linear: Linear,
+    filters: Filters,
+    known: Array | None,
+    settings: IdentifySettings,
+    rng: np.random.Generator,
+) -> Posterior:
+    """Return the posterior of a linear model.
+
+    Errors are drawn by what is left with no effect and with all of them.
+
+    Args:
+        linear: The linear model.
+        filters: Filters of its rows, by channel.
+        known: Deviation of each channel's white errors in units, shape (c,).
+        settings: Settings of what is spent.
+        rng: Source of the draws.
+    """
+    own, model = settings, linear.model
+    errors = ChannelErrors(filters.processes, filters.grams(model.rows), known)
+    every = linear.effect < 0, np.ones(len(linear.effect), dtype=bool)
+    places = [errors.places(model, free, own.num_places, rng) for free in every]
+    drawn = errors.drawn(np.concatenate(places), own.num_errors, rng)
+    return Posterior(model, linear.effect, drawn, own.absent, own.near)
 
 
 def _bare(
@@ -260,10 +279,10 @@ def _bare(
     )
 
 
-def _with(bare: Rival, effects: Sequence[Effect]) -> Rival:
-    """Return a rival with some effects."""
+def with_effects(rival: Rival, effects: Sequence[Effect]) -> Rival:
+    """Return a rival with these effects."""
     key = ModelKey(tuple(e.name for e in effects))
-    return replace(bare, key=key, effects=effects)
+    return replace(rival, key=key, effects=effects)
 
 
 def _searched(
@@ -309,34 +328,32 @@ def _sizes(rival: Rival, residual: Array, settings: IdentifySettings) -> Array:
 
 def _beside(
     whole: Rival, bare: LinearModel, unit: Array, settings: IdentifySettings
-) -> Linear:
-    """Return a model with effects that are absent so far, at the fit without."""
-    columns, effect = whole.coordinates.places, np.full(whole.dim, -1)
-    null = np.full(whole.dim, np.nan)
-    for k, own in enumerate(whole.effects):
-        effect[columns[own.name]] = k
-        null[effect == k] = at_null(whole, own, settings.tried)[0]
-    found = Linear(whole, effect, null, unit, bare)
-    return found.around(bare, effect < 0, unit, settings.tried)
+) -> tuple[Linear, tuple[str, ...]]:
+    """Return a model with effects that are absent so far, and what parameters imitate.
 
+    Those and what changes nothing are left out.
 
-def _told(found: Linear, least: float) -> tuple[list[Effect], tuple[str, ...]]:
-    """Return the effects that no change of the parameters imitates, and the others.
-
-    Those that change nothing are neither.
+    Args:
+        whole: Rival with all effects.
+        bare: Fit without any.
+        unit: Units of the residuals, shape (N,).
+        settings: Settings of what is told apart.
     """
-    jacobian, effect = found.model.jacobian, found.effect
-    basis = basis_of(jacobian[:, effect < 0])
+    own, effect, null = settings, np.full(whole.dim, -1), np.full(whole.dim, np.nan)
+    for k, e in enumerate(whole.effects):
+        effect[whole.coordinates.places[e.name]] = k
+        null[effect == k] = at_null(whole, e, own.tried)[0]
+    found = Linear(whole, effect, null, unit, bare)
+    found = found.around(bare, effect < 0, unit, own.tried)
+    jacobian, basis = found.fit.jacobian, basis_of(bare.jacobian)
     left = jacobian - basis @ (basis.T @ jacobian)
-    own, whole = (
-        np.sqrt(np.bincount(effect + 1, (part**2).sum(0))[1:])
+    apart, size = (
+        np.sqrt(np.bincount(effect + 1, (part**2).sum(0), len(whole.effects) + 1))[1:]
         for part in (left, jacobian)
     )
-    effects, is_told = found.rival.effects, own > least * whole
-    is_alias = ~is_told & (whole > 0)
-    aliases = [e.name for e, alias in zip(effects, is_alias, strict=True) if alias]
-    told = [e for e, own in zip(effects, is_told, strict=True) if own]
-    return told, (*aliases,)
+    told = apart > own.alias * size
+    each = zip(whole.effects, ~told & (size > 0), strict=True)
+    return found.without(told), tuple(e.name for e, alias in each if alias)
 
 
 @dataclass(frozen=True)
@@ -373,10 +390,10 @@ def spread(found: Fitted, fewest: int) -> Spread:
     likely = np.append(draws.present.mean(0) > 0.5, True)
     free = (found.rival.coordinates.trial_of() < 0) & likely[found.effect]
     parts = parts_of(m, fewest, fewest)
-    white = found.whitened(found.rows[:, np.append(True, free)], parts)
+    white = found.whitened(found.model.rows[:, np.append(True, free)], parts)
     each = [white[parts == f] for f in range(int(parts.max()) + 1)]
     grams = np.stack([rows.T @ rows for rows in each])
-    precision, linear = grams[:, 1:, 1:], -grams[:, 1:, 0]
+    precision, linear = grams[:, 1:, 1:], grams[:, 1:, 0]
     total = precision.sum(0)
     ridge = np.diag(1e-6 * np.diag(total) + 1e-12)
     best = np.linalg.solve(total + ridge, linear.sum(0))

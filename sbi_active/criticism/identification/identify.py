@@ -254,12 +254,12 @@ def _log_ratio(found: Fitted, at: Array) -> Array:
     """Return the log density of draws beside that of the linear model, (k,)."""
     u, m = found.draws.u[at], found.measurements
     true = found.rival.residual(found.origin + u)[0] / found.unit
-    rows = found.rows
-    linear = rows[:, 0] + u @ rows[:, 1:].T
+    model = found.model
+    linear = model.at(u)
     both = found.whitened(np.concatenate([true, linear]).T, 0 * m.trial)
     square = (both**2).sum(0)
-    p, c = found.unknowns, found.rival.coordinates
-    gaussian = -0.5 * (p.precision * (u - p.center) ** 2).sum(1)
+    c = found.rival.coordinates
+    gaussian = -0.5 * (((u - model.center) / model.sd) ** 2).sum(1)
     # At a bound, where absent effects stand, rounding would be outside.
     log_w = c.log_prob(np.clip(found.origin + u, c.low, c.high)) - gaussian
     log_w = log_w + 0.5 * (square[len(at) :] - square[: len(at)])

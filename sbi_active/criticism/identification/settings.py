@@ -12,30 +12,6 @@ from sbi_active.criticism.linear.processes import Processes, time_scales
 
 
 @dataclass(frozen=True, kw_only=True)
-class SamplerSettings:
-    """Numbers of draws, and priors of doubtful effects and of errors.
-
-    Attributes:
-        chains: Independent ones, side by side.
-        burnt: Sweeps that are left out of each: after half as many draws are those of
-            later ones, since u moves as a whole.
-        few: Sweeps where only means are asked for.
-        many: Sweeps of a belief: ends of a 95 % interval are then known to some .5 %.
-        absent: Prior probability that no doubtful effect is there, one half for want
-            of anything better; and that a channel's errors are white.
-        flat: Precision in units of the inverse square of a range, which leaves uniform
-            priors as they are and directions that nothing tells solvable.
-    """
-
-    chains: int = 64
-    burnt: int = 6
-    few: int = 6
-    many: int = 26
-    absent: float = 0.5
-    flat: float = 1e-4
-
-
-@dataclass(frozen=True, kw_only=True)
 class IdentifySettings:
     """Settings of what is spent, and of what is told apart.
 
@@ -46,7 +22,15 @@ class IdentifySettings:
         fit: Searches from these, at least, and how far they go.
         starts_each: Searches for each parameter.
         kept_each: Searches that go on, for each parameter.
-        sampler: Draws of the linear model.
+        num_draws: Draws of the posterior: ends of a 95 % interval are then known to
+            some 1 %.
+        num_errors: Draws of the errors that the linear model is summed over.
+        num_places: Draws of the coordinates without effects, and with all, by whose
+            residuals these are drawn: one would know the errors' size too well.
+        absent: Prior probability that no doubtful effect is there, one half for want
+            of anything better.
+        near: Nats behind the best set of effects up to which larger and smaller ones
+            are looked at.
         step: Step of finite differences, in deviations of the prior.
         tried: Deviations of the prior by which an effect that is absent is tried: many
             are flat at their null.
@@ -91,7 +75,11 @@ class IdentifySettings:
     fit: FitSettings = FitSettings(num_starts=3, num_kept=1, first=5)
     starts_each: float = 1.0
     kept_each: float = 0.3
-    sampler: SamplerSettings = SamplerSettings()
+    num_draws: int = 2_000
+    num_errors: int = 128
+    num_places: int = 8
+    absent: float = 0.5
+    near: float = 3.0
     step: float = 1e-4
     tried: float = 0.05
     alias: float = 0.02
