@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import compress
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,7 +28,7 @@ from sbi_active.criticism.linear.model import (
     enlarged,
     linearize,
 )
-from sbi_active.criticism.linear.processes import Filters, Processes, parts_of, whitened
+from sbi_active.criticism.linear.processes import Filters, parts_of, whitened
 from sbi_active.criticism.results import ModelKey
 from sbi_active.criticism.rivals.error_models import NoiseCell, NoiseGrid
 from sbi_active.criticism.rivals.rival import Rival
@@ -90,11 +91,10 @@ class Linear:
             kept: Mask of those that it keeps, shape (e,).
         """
         at = np.append(kept, True)[self.effect]
-        effects = [e for e, keep in zip(self.rival.effects, kept, strict=True) if keep]
         number = np.append(np.cumsum(kept) - 1, -1)
         return replace(
             self,
-            rival=with_effects(self.rival, effects),
+            rival=with_effects(self.rival, [*compress(self.rival.effects, kept)]),
             effect=number[self.effect[at]],
             null=self.null[at],
             fit=self.fit.part(at),
@@ -132,12 +132,12 @@ class Fitted(Linear):
     """A linear model with posterior draws.
 
     Attributes:
-        errors: Hypotheses of the errors.
+        errors: Errors of each channel.
         draws: Draws of u - ``origin``.
         aliases: Effects that are left out since parameters do the same.
     """
 
-    errors: Processes
+    errors: ChannelErrors
     draws: Draws
     aliases: tuple[str, ...]
 
@@ -148,14 +148,10 @@ class Fitted(Linear):
             rows: Rows in units.
             fold: Part of each number, shape (N,), with errors of its own.
         """
-        m, draws = self.measurements, self.draws
-        chosen = np.array([np.bincount(h).argmax() for h in draws.errors.T])
-        size = [
-            np.sqrt(np.mean(own[h == best] ** 2))
-            for own, h, best in zip(draws.size.T, draws.errors.T, chosen, strict=True)
-        ]
-        white = whitened(rows, self.errors, m, chosen, fold)
-        return white / np.array(size)[m.channel, None]
+        m, own = self.measurements, self.errors
+        shape, variance = own.likeliest(self.draws.u.mean(0))
+        white = whitened(rows, own.processes, m, shape, fold)
+        return white / np.sqrt(variance)[m.channel, None]
 
 
 def fitted(
@@ -186,13 +182,15 @@ def fitted(
     linear, aliases = _beside(with_effects(bare, doubtful), fit, unit, own)
     m, c = linear.measurements, linear.rival.coordinates
     share = 1.0 if known_sd is None else ((known_sd[m.channel] / unit) ** 2).min()
-    errors = own.errors(m, float(share))
-    filters = Filters(errors, m, 0 * m.trial, m.channel)
+    filters = Filters(own.errors(m, float(share)), m, 0 * m.trial, m.channel)
     there, some = np.zeros(len(linear.rival.effects), dtype=bool), bare
     for again in range(own.linearized):
-        known = None if known_sd is None else known_sd / linear.sizes
-        posterior = _posterior(linear, filters, known, own, rng)
-        draws = posterior.draws(own.num_draws, rng)
+        errors = ChannelErrors(
+            processes=filters.processes,
+            grams=filters.grams(linear.model.rows),
+            known=None if known_sd is None else known_sd / linear.sizes,
+        )
+        draws = _posterior(linear, errors, own, rng).draws(own.num_draws, rng)
         before, there = there, draws.present.mean(0) > own.likely
         free = np.append(there, True)[linear.effect]
         u = linear.origin + np.where(free, draws.u.mean(0), 0.0)
@@ -200,23 +198,20 @@ def fitted(
         move = np.abs(u - linear.fit.u) / (draws.u.std(0) + own.step)
         is_near = not is_new and move.max() < own.moved
         if is_near or again == own.linearized - 1:
-            break
+            return Fitted(**vars(linear), errors=errors, draws=draws, aliases=aliases)
         if is_new:
-            effects = zip(linear.rival.effects, there, strict=True)
-            some = with_effects(bare, [e for e, keep in effects if keep])
-            fit, unit = _settled(some, u[free], linear.unit, own)
+            some = with_effects(bare, [*compress(linear.rival.effects, there)])
+            fit, unit = _settled(some, u[free], own)
             linear = linear.around(fit, free, unit, own.tried)
         else:
-            fit = linearize(some, u[free], linear.unit)
-            fit = centered(some, fit, linear.unit)
-            linear = linear.around(fit, free, linear.unit)
-    return Fitted(**vars(linear), errors=errors, draws=draws, aliases=aliases)
+            fit = centered(some, linearize(some, u[free], unit), unit)
+            linear = linear.around(fit, free, unit)
+    raise AssertionError("unreachable")
 
 
 def _posterior(
     linear: Linear,
-    filters: Filters,
-    known: Array | None,
+    errors: ChannelErrors,
     settings: IdentifySettings,
     rng: np.random.Generator,
 ) -> Posterior:
@@ -226,17 +221,16 @@ def _posterior(
 
     Args:
         linear: The linear model.
-        filters: Filters of its rows, by channel.
-        known: Deviation of each channel's white errors in units, shape (c,).
+        errors: Errors of its rows.
         settings: Settings of what is spent.
         rng: Source of the draws.
     """
     own, model = settings, linear.model
-    errors = ChannelErrors(filters.processes, filters.grams(model.rows), known)
     every = linear.effect < 0, np.ones(len(linear.effect), dtype=bool)
     places = [errors.places(model, free, own.num_places, rng) for free in every]
     drawn = errors.drawn(np.concatenate(places), own.num_errors, rng)
-    return Posterior(model, linear.effect, drawn, own.absent, own.near)
+    effects = linear.rival.effects
+    return Posterior(model, effects, linear.effect, *drawn, own.near)
 
 
 def _bare(
@@ -302,21 +296,15 @@ def _searched(
         num_starts=max(fit.num_starts, round(own.starts_each * dim)),
         num_kept=max(fit.num_kept, round(own.kept_each * dim)),
     )
-    return _settled(bare, best_fit(bare, u, unit, fit).u, unit, own)
+    return _settled(bare, best_fit(bare, u, unit, fit).u, own)
 
 
 def _settled(
-    rival: Rival, u: Array, unit: Array, settings: IdentifySettings
+    rival: Rival, u: Array, settings: IdentifySettings
 ) -> tuple[LinearModel, Array]:
-    """Return a best fit in which every channel is weighed by its own residual."""
-    model = polished(rival, u, unit, settings.fit)
-    for _ in range(settings.rounds):
-        sizes = _sizes(rival, model.residual * unit, settings)
-        if np.log(unit / sizes).mean() < settings.worth:
-            break
-        unit = sizes
-        model = polished(rival, model.u, unit, settings.fit)
-    return model, unit
+    """Return a best fit that weighs each channel by its residual at the start."""
+    unit = _sizes(rival, rival.residual(u[None])[0][0], settings)
+    return polished(rival, u, unit, settings.fit), unit
 
 
 def _sizes(rival: Rival, residual: Array, settings: IdentifySettings) -> Array:
@@ -352,8 +340,8 @@ def _beside(
         for part in (left, jacobian)
     )
     told = apart > own.alias * size
-    each = zip(whole.effects, ~told & (size > 0), strict=True)
-    return found.without(told), tuple(e.name for e, alias in each if alias)
+    aliases = compress(whole.effects, ~told & (size > 0))
+    return found.without(told), tuple(e.name for e in aliases)
 
 
 @dataclass(frozen=True)

@@ -279,15 +279,14 @@ def _beside(found: Fitted) -> dict[str, float]:
 
 
 def _errors(found: Fitted, model: SimulatorModel) -> dict[str, dict[str, float]]:
-    """Return the errors of each channel, as posterior medians."""
-    draws, known, said = found.draws, found.errors, {}
-    names = model.channel_names
-    for c, unit in enumerate(found.sizes.tolist()):
-        h = draws.errors[:, c]
+    """Return the likeliest errors of each channel."""
+    known, names, said = found.errors.processes, model.channel_names, {}
+    each = zip(*found.errors.likeliest(found.draws.u.mean(0)), strict=True)
+    for c, (h, variance) in enumerate(each):
         said[names[c] if names else f"channel {c}"] = {
-            "sd": unit * float(np.median(draws.size[:, c])),
-            "white": float(np.median(known.white[h])),
-            "time": float(np.median(np.where(h > 0, known.time[h], 0.0))),
+            "sd": float(found.sizes[c] * variance**0.5),
+            "white": float(known.white[h]),
+            "time": float(known.time[h] if h > 0 else 0.0),
         }
     return said
 

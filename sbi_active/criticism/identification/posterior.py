@@ -7,21 +7,25 @@ r"""The posterior of a linear model whose errors are unknown and whose effects d
 over sets s of effects that are there and draws j of all channels' errors
 (:mod:`.channels`). An effect is absent, its part of u zero, unless it is there: what
 may be missing widens the intervals by as much as the logs leave it open, and hardly
-where they exclude it. Sets are enumerated from none on, beside those that are near the
-best.
+where they exclude it. Sets are as probable as in a verdict, and looked at from none on,
+beside those that are near the best.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sbi_active.arrays import Array
-from sbi_active.criticism.identification.channels import ErrorDraws
+from sbi_active.criticism.effects.effect import Effect
 from sbi_active.criticism.linear.mixture import integrated
 from sbi_active.criticism.linear.model import LinearModel
+from sbi_active.criticism.results import NONE
+from sbi_active.criticism.steps.detection import log_prior, log_priors
 from sbi_active.inference.sampling.truncated import draws_between
 from sbi_active.inference.sampling.weights import (
     log_sum_exp,
@@ -29,38 +33,30 @@ from sbi_active.inference.sampling.weights import (
     systematic,
 )
 
-Flags = NDArray[np.bool_]
+EffectSet = frozenset[int]
 
 
-@dataclass(frozen=True)
-class Draws:
+class Draws(NamedTuple):
     """Draws of the posterior.
 
     Attributes:
         u: Coordinates, shape (n, d).
         present: Whether each effect is there, bool, shape (n, e).
-        errors: Hypothesis of each channel, shape (n, c).
-        size: Deviation of each channel's errors, shape (n, c).
     """
 
     u: Array
-    present: Flags
-    errors: NDArray[np.intp]
-    size: Array
+    present: NDArray[np.bool_]
 
 
-@dataclass(frozen=True)
-class Component:
+class Component(NamedTuple):
     """A set of effects, given each draw of the errors.
 
     Attributes:
-        present: Whether each effect is there, shape (e,).
         log_p: Log probability, unnormalized, shape (j,).
         mean: Means of the coordinates that are free, shape (j, k).
         cov: Their covariances, shape (j, k, k).
     """
 
-    present: Flags
     log_p: Array
     mean: Array
     cov: Array
@@ -72,56 +68,50 @@ class Posterior:
 
     Attributes:
         model: Linear model with all effects, which counts from where they vanish.
+        effects: The effects.
         effect: Number of the effect that a coordinate belongs to, -1 for none, (d,).
-        errors: Draws of the errors.
-        absent: Prior probability that no effect is there.
+        gram: Gram matrix of its rows given each draw of the errors, shape (j, k, k).
+        log_weight: Log weight of each of these draws, shape (j,).
         near: Nats behind the best set up to which a set's neighbors are looked at, with
             an effect more or less.
         sets: Sets of effects that were looked at.
     """
 
     model: LinearModel
+    effects: Sequence[Effect]
     effect: NDArray[np.int64]
-    errors: ErrorDraws
-    absent: float
+    gram: Array
+    log_weight: Array
     near: float
-    sets: dict[bytes, Component] = field(default_factory=dict)
+    sets: dict[EffectSet, Component] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        num = int(self.effect.max(initial=-1)) + 1
-        done: set[bytes] = set()
-        total = {self._look(np.zeros(num, dtype=bool))[0]: np.inf}
-        while total:
-            best = max(total, key=total.__getitem__)
+        log_p: dict[EffectSet, float] = {}
+        new = {EffectSet()}
+        done: set[EffectSet] = set()
+        while new:
+            best = max(new, key=lambda known: log_p.get(known, 0.0))
             done.add(best)
-            present = self.sets[best].present
-            for e in range(num):
-                other = present.copy()
-                other[e] ^= True
-                if other.tobytes() not in self.sets:
-                    self._look(other)
-            every = {k: float(log_sum_exp(s.log_p)) for k, s in self.sets.items()}
-            least = max(every.values()) - self.near
-            total = {k: v for k, v in every.items() if v > least and k not in done}
+            beside = (best ^ {e} for e in range(len(self.effects)))
+            for one in {best, *beside} - log_p.keys():
+                self.sets[one] = self._component(one)
+                log_p[one] = float(log_sum_exp(self.sets[one].log_p))
+            least = max(log_p.values()) - self.near
+            new = {one for one, value in log_p.items() if value > least} - done
 
-    def free(self, present: Flags) -> Flags:
-        """Return the coordinates that are not zero, (..., d), by present effects."""
-        every = np.ones((*present.shape[:-1], 1), dtype=bool)
-        return np.concatenate([present, every], -1)[..., self.effect]
+    def free(self, present: EffectSet) -> NDArray[np.bool_]:
+        """Return the coordinates that are not zero, (d,), by the effects present."""
+        return np.isin(self.effect, [-1, *present])
 
-    def _look(self, present: Flags) -> tuple[bytes, Component]:
-        """Record a set of effects with its evidence, given each draw of the errors."""
-        free, num = self.free(present), len(present)
+    def _component(self, present: EffectSet) -> Component:
+        """Return a set of effects with its evidence, given each draw of the errors."""
+        free, prior = self.free(present), log_priors(self.effects)
         at = np.flatnonzero(np.append(True, free))
-        gram = self.errors.gram[:, at[:, None], at]
+        gram = self.gram[:, at[:, None], at]
         log_z, mean, cov = integrated(gram, self.model.part(free), (1.0,))
-        none = np.log(self.absent) / max(num, 1)  # of one effect
-        there = present.sum()
-        log_prior = there * np.log(-np.expm1(none)) + (num - there) * none
-        log_p = self.errors.log_weight + log_z[:, 0] + log_prior
-        key = present.tobytes()
-        self.sets[key] = Component(present, log_p, mean[:, 0], cov[:, 0])
-        return key, self.sets[key]
+        names = tuple(self.effects[e].name for e in sorted(present))
+        log_p = log_prior(names, prior) if names else prior[NONE]
+        return Component(self.log_weight + log_z[:, 0] + log_p, mean[:, 0], cov[:, 0])
 
     @property
     def log_p(self) -> Array:
@@ -137,17 +127,15 @@ class Posterior:
         """
         model, log_p = self.model, self.log_p
         share = normalized(log_p.ravel())
-        flat = systematic(share, num, float(rng.random()))
-        which, error = np.unravel_index(flat, log_p.shape)
+        place = systematic(share, num, float(rng.random()))
+        which, error = np.unravel_index(place, log_p.shape)
         u, log_w = np.zeros((num, len(model.u))), np.zeros(num)
-        sets = [*self.sets.values()]
-        for s in np.unique(which):
-            own, at = sets[s], np.flatnonzero(which == s)
-            free = self.free(own.present)
+        present = np.zeros((num, len(self.effects)), dtype=bool)
+        for s, (one, own) in enumerate(self.sets.items()):
+            at, free = np.flatnonzero(which == s), self.free(one)
             given = own.mean[error[at]], own.cov[error[at]]
             drawn = draws_between(*given, model.low[free], model.high[free], rng)
             u[np.ix_(at, free)], log_w[at] = drawn
+            present[np.ix_(at, [*one])] = True
         kept = systematic(normalized(log_w), num, float(rng.random()))
-        present = np.stack([own.present for own in sets])[which[kept]]
-        errors, size = self.errors.shape, np.sqrt(self.errors.variance)
-        return Draws(u[kept], present, errors[error[kept]], size[error[kept]])
+        return Draws(u[kept], present[kept])

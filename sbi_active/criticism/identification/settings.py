@@ -27,8 +27,6 @@ class IdentifySettings:
         num_errors: Draws of the errors that the linear model is summed over.
         num_places: Draws of the coordinates without effects, and with all, by whose
             residuals these are drawn: one would know the errors' size too well.
-        absent: Prior probability that no doubtful effect is there, one half for want
-            of anything better.
         near: Nats behind the best set of effects up to which larger and smaller ones
             are looked at.
         step: Step of finite differences, in deviations of the prior.
@@ -39,8 +37,6 @@ class IdentifySettings:
         likely: Probability from which an effect is fitted.
         linearized: Times at most that the model is linearized anew.
         moved: A move that is worth it, in posterior deviations.
-        rounds: Times at most that channels are weighed by their residuals.
-        worth: Mean fall of the logarithm of these sizes that is worth another time.
         smallest: Residual that a channel is taken to have at least, in its deviations.
         shares: Shares of the variance that are white, of errors of unknown size.
         least: Smallest share of a declared white error: below it sums of squares lose
@@ -78,7 +74,6 @@ class IdentifySettings:
     num_draws: int = 2_000
     num_errors: int = 128
     num_places: int = 8
-    absent: float = 0.5
     near: float = 3.0
     step: float = 1e-4
     tried: float = 0.05
@@ -86,8 +81,6 @@ class IdentifySettings:
     likely: float = 0.1
     linearized: int = 6
     moved: float = 0.3
-    rounds: int = 10
-    worth: float = 0.01
     smallest: float = 1e-9
     shares: tuple[float, ...] = (1e-4, 1e-3, 0.01, 0.03, 0.1, 0.3, 0.6, 0.9)
     least: float = 1e-12

@@ -49,7 +49,7 @@ def draws_between(
     """
     sd = np.sqrt(np.einsum("nii->ni", cov))
     alone = log_inside(mean, sd, low, high)
-    order = np.argsort(alone.mean(0), kind="stable")
+    order = np.argsort(alone.sum(0), kind="stable")
     root = lower_factors(cov[:, order[:, None], order])
     z, u, log_weight = np.zeros_like(mean), np.empty_like(mean), -alone.sum(1)
     for i, j in enumerate(order):

@@ -52,11 +52,17 @@ def white(model, known: np.ndarray | None):
     return ChannelErrors(WHITE, grams, known, white=1.0)
 
 
+def shift(x, phi, action, context):
+    """Return the first channel of x with an offset."""
+    return x + phi[:, None] * torch.tensor([1.0, 0.0], dtype=x.dtype)
+
+
 def posterior(model, effect=(-1, -1, -1), *, is_known=True):
     errors, number = white(model, np.ones(1) if is_known else None), np.array(effect)
     rng = np.random.default_rng(1)
     drawn = errors.drawn(errors.places(model, number < 1, 8, rng), 4096, rng)
-    return Posterior(model, number, drawn, absent=0.5, near=3.0)
+    effects = [on_outcomes("parabola", shift, 1.0)] * (max(effect) + 1)
+    return Posterior(model, effects, number, *drawn, near=3.0)
 
 
 def draws(model, effect=(-1, -1, -1)):
@@ -233,10 +239,6 @@ def test_errors_far_beyond_the_declared_one_have_their_size(times):
 
 def test_what_may_be_there_is_found_or_not():
     """A shift of the position beside it: found, and theta as narrow as before."""
-
-    def shift(x, phi, action, context):
-        return x + phi[:, None] * torch.tensor([1.0, 0.0], dtype=x.dtype)
-
     bias = on_outcomes("bias", shift, 0.5)
     extra = torch.tensor([0.1, 0.0])
     for there in (False, True):
