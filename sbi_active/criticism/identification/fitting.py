@@ -153,6 +153,22 @@ class Fitted(Linear):
         white = whitened(rows, own.processes, m, shape, fold)
         return white / np.sqrt(variance)[m.channel, None]
 
+    def off(self, u: Array, free: NDArray[np.bool_]) -> Array:
+        """Return how far the simulator at a place would move it, in deviations, (k,).
+
+        Args:
+            u: Mean of the posterior, shape (d,).
+            free: Coordinates that may move, shape (d,).
+        """
+        c, fit = self.rival.coordinates, self.fit
+        bent = self.rival.residual(u[None])[0][0] / self.unit - fit.at(u[None])[0]
+        rows = np.concatenate([bent[:, None], fit.rows[:, 1:][:, free]], 1)
+        white = self.whitened(rows, 0 * self.measurements.trial)
+        slope, precision = white[:, 1:], np.diag(self.model.sd[free] ** -2)
+        step = np.linalg.solve(slope.T @ slope + precision, slope.T @ white[:, 0])
+        move = np.clip(u[free] + step, c.low[free], c.high[free]) - u[free]
+        return np.abs(move) / (self.draws.u.std(0)[free] + self.rival.step)
+
 
 def fitted(
     model: SimulatorModel,
@@ -183,30 +199,27 @@ def fitted(
     m, c = linear.measurements, linear.rival.coordinates
     share = 1.0 if known_sd is None else ((known_sd[m.channel] / unit) ** 2).min()
     filters = Filters(own.errors(m, float(share)), m, 0 * m.trial, m.channel)
-    there, some = np.zeros(len(linear.rival.effects), dtype=bool), bare
-    for again in range(own.linearized):
+    there, again = np.zeros(len(linear.rival.effects), dtype=bool), own.linearized
+    while True:
         errors = ChannelErrors(
             processes=filters.processes,
             grams=filters.grams(linear.model.rows),
             known=None if known_sd is None else known_sd / linear.sizes,
         )
         draws = _posterior(linear, errors, own, rng).draws(own.num_draws, rng)
+        found = Fitted(**vars(linear), errors=errors, draws=draws, aliases=aliases)
         before, there = there, draws.present.mean(0) > own.likely
-        free = np.append(there, True)[linear.effect]
+        free, is_new = np.append(there, True)[linear.effect], (there != before).any()
         u = linear.origin + np.where(free, draws.u.mean(0), 0.0)
-        u, is_new = np.clip(u, c.low, c.high), bool((there != before).any())
-        move = np.abs(u - linear.fit.u) / (draws.u.std(0) + own.step)
-        is_near = not is_new and move.max() < own.moved
-        if is_near or again == own.linearized - 1:
-            return Fitted(**vars(linear), errors=errors, draws=draws, aliases=aliases)
+        u, again = np.clip(u, c.low, c.high), again - 1
+        if not again or not (is_new or found.off(u, free).max() > own.moved):
+            return found
+        some = with_effects(bare, [*compress(linear.rival.effects, there)])
         if is_new:
-            some = with_effects(bare, [*compress(linear.rival.effects, there)])
             fit, unit = _settled(some, u[free], own)
-            linear = linear.around(fit, free, unit, own.tried)
         else:
             fit = centered(some, linearize(some, u[free], unit), unit)
-            linear = linear.around(fit, free, unit)
-    raise AssertionError("unreachable")
+        linear = linear.around(fit, free, unit, own.tried if is_new else None)
 
 
 def _posterior(
@@ -217,7 +230,8 @@ def _posterior(
 ) -> Posterior:
     """Return the posterior of a linear model.
 
-    Errors are drawn by what is left with no effect and with all of them.
+    Errors are drawn by what is left with no effect and with all of them, and then by
+    what the posterior given these leaves.
 
     Args:
         linear: The linear model.
@@ -225,12 +239,16 @@ def _posterior(
         settings: Settings of what is spent.
         rng: Source of the draws.
     """
-    own, model = settings, linear.model
+    own, model, effects = settings, linear.model, linear.rival.effects
     every = linear.effect < 0, np.ones(len(linear.effect), dtype=bool)
     places = [errors.places(model, free, own.num_places, rng) for free in every]
-    drawn = errors.drawn(np.concatenate(places), own.num_errors, rng)
-    effects = linear.rival.effects
-    return Posterior(model, effects, linear.effect, *drawn, own.near)
+
+    def given() -> Posterior:
+        drawn = errors.drawn(np.concatenate(places), own.num_errors, rng)
+        return Posterior(model, effects, linear.effect, *drawn, own.near)
+
+    places.append(given().draws(own.num_places, rng).u)
+    return given()
 
 
 def _bare(

@@ -36,7 +36,9 @@ class IdentifySettings:
             own, below which it is an alias of them.
         likely: Probability from which an effect is fitted.
         linearized: Times at most that the model is linearized anew.
-        moved: A move that is worth it, in posterior deviations.
+        moved: Posterior deviations that the simulator at the posterior's mean may move
+            it by, without which the model is linear enough: a tenth leaves a 95 %
+            interval .1 % short.
         smallest: Residual that a channel is taken to have at least, in its deviations.
         shares: Shares of the variance that are white, of errors of unknown size.
         least: Smallest share of a declared white error: below it sums of squares lose
@@ -80,7 +82,7 @@ class IdentifySettings:
     alias: float = 0.02
     likely: float = 0.1
     linearized: int = 6
-    moved: float = 0.3
+    moved: float = 0.1
     smallest: float = 1e-9
     shares: tuple[float, ...] = (1e-4, 1e-3, 0.01, 0.03, 0.1, 0.3, 0.6, 0.9)
     least: float = 1e-12
