@@ -8,7 +8,6 @@ from itertools import compress
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
 from torch.distributions import Distribution
 
 from sbi_active.arrays import Array
@@ -28,17 +27,13 @@ from sbi_active.criticism.linear.model import (
     enlarged,
     linearize,
 )
-from sbi_active.criticism.linear.processes import Filters, parts_of, whitened
+from sbi_active.criticism.linear.processes import Filters, whitened
 from sbi_active.criticism.results import ModelKey
 from sbi_active.criticism.rivals.error_models import NoiseCell, NoiseGrid
 from sbi_active.criticism.rivals.rival import Rival
 from sbi_active.criticism.rivals.trial_simulator import TrialSimulator
 from sbi_active.inference.sampling.least_squares import basis_of
 from sbi_active.simulation import SimulatorModel
-
-#: Deviation of the Gaussian that stands for a flat prior, in units of its range: it
-#: leaves the prior as it is, and directions that nothing tells solvable.
-FLAT = 100.0
 
 
 @dataclass(frozen=True)
@@ -105,16 +100,18 @@ class Linear:
         """Point of linearization, with effects at their null, shape (d,)."""
         return np.where(self.effect < 0, self.fit.u, self.null)
 
-    @property
-    def model(self) -> LinearModel:
-        """The linear model at the origin, from which coordinates count.
+    def model(self, *, flat: float = 100.0) -> LinearModel:
+        """Return the linear model at the origin, from which coordinates count.
 
-        Its prior between two bounds is flat there, but for effects.
+        Args:
+            flat: Deviation of the Gaussian that stands for a flat prior, in units of
+                its range: it leaves the prior as it is, and directions that nothing
+                tells solvable.
         """
         fit, origin = self.fit, self.origin
         model = replace(fit, u=origin, residual=fit.at(origin[None])[0]).from_here()
         is_flat = (self.effect < 0) & (self.rival.coordinates.precision == 0)
-        return replace(model, sd=np.where(is_flat, FLAT * (fit.high - fit.low), fit.sd))
+        return replace(model, sd=np.where(is_flat, flat * (fit.high - fit.low), fit.sd))
 
     @property
     def sizes(self) -> Array:
@@ -164,7 +161,7 @@ class Fitted(Linear):
         bent = self.rival.residual(u[None])[0][0] / self.unit - fit.at(u[None])[0]
         rows = np.concatenate([bent[:, None], fit.rows[:, 1:][:, free]], 1)
         white = self.whitened(rows, 0 * self.measurements.trial)
-        slope, precision = white[:, 1:], np.diag(self.model.sd[free] ** -2)
+        slope, precision = white[:, 1:], np.diag(self.model().sd[free] ** -2)
         step = np.linalg.solve(slope.T @ slope + precision, slope.T @ white[:, 0])
         move = np.clip(u[free] + step, c.low[free], c.high[free]) - u[free]
         return np.abs(move) / (self.draws.u.std(0)[free] + self.rival.step)
@@ -203,7 +200,7 @@ def fitted(
     while True:
         errors = ChannelErrors(
             processes=filters.processes,
-            grams=filters.grams(linear.model.rows),
+            grams=filters.grams(linear.model().rows),
             known=None if known_sd is None else known_sd / linear.sizes,
         )
         draws = _posterior(linear, errors, own, rng).draws(own.num_draws, rng)
@@ -239,7 +236,7 @@ def _posterior(
         settings: Settings of what is spent.
         rng: Source of the draws.
     """
-    own, model, effects = settings, linear.model, linear.rival.effects
+    own, model, effects = settings, linear.model(), linear.rival.effects
     every = linear.effect < 0, np.ones(len(linear.effect), dtype=bool)
     places = [errors.places(model, free, own.num_places, rng) for free in every]
 
@@ -360,60 +357,3 @@ def _beside(
     told = apart > own.alias * size
     aliases = compress(whole.effects, ~told & (size > 0))
     return found.without(told), tuple(e.name for e in aliases)
-
-
-@dataclass(frozen=True)
-class Spread:
-    """The disagreement between parts of the trials.
-
-    Attributes:
-        p_value: p-value of each parameter being the same in all parts, shape (d,).
-        deviation: Deviation of the parts from their mean, as far as it is none of their
-            errors, shape (f, d), such that normal multiples of them add up to the
-            spread.
-        sd: Standard deviation of each parameter by all trials if it had no bounds,
-            shape (d,).
-    """
-
-    p_value: Array
-    deviation: Array
-    sd: Array
-
-    def widen(self, u: Array, by: float, rng: np.random.Generator) -> Array:
-        """Return draws (n, d) as far off as the parts are from each other, times by."""
-        weight = rng.standard_normal((len(u), len(self.deviation)))
-        return u + by * weight @ self.deviation
-
-
-def spread(found: Fitted, fewest: int) -> Spread:
-    """Return the disagreement of parts of the trials about theta.
-
-    Args:
-        found: The model, linear.
-        fewest: Number of parts at least.
-    """
-    draws, m, own = found.draws, found.measurements, found.rival.theta_dim
-    likely = np.append(draws.present.mean(0) > 0.5, True)
-    free = (found.rival.coordinates.trial_of() < 0) & likely[found.effect]
-    parts = parts_of(m, fewest, fewest)
-    white = found.whitened(found.model.rows[:, np.append(True, free)], parts)
-    each = [white[parts == f] for f in range(int(parts.max()) + 1)]
-    grams = np.stack([rows.T @ rows for rows in each])
-    precision, linear = grams[:, 1:, 1:], grams[:, 1:, 0]
-    total = precision.sum(0)
-    ridge = np.diag(1e-6 * np.diag(total) + 1e-12)
-    best = np.linalg.solve(total + ridge, linear.sum(0))
-    cov = np.linalg.inv(precision + ridge)
-    each = best + np.einsum("fij,fj->fi", cov, linear - precision @ best)
-    each, sd = each[:, :own], np.sqrt(np.einsum("fii->fi", cov))[:, :own]
-    weight = 1 / sd**2
-    mean = (weight * each).sum(0) / weight.sum(0)
-    square, freedom = (weight * (each - mean) ** 2).sum(0), len(each) - 1
-    of_parts = weight.sum(0) - (weight**2).sum(0) / weight.sum(0)
-    variance = np.maximum(square - freedom, 0.0) / np.maximum(of_parts, 1e-300)
-    # Deviations that are far off by their errors count less.
-    off = np.sqrt(weight) * (each - mean)
-    off = off / np.maximum(np.linalg.norm(off, axis=0), 1e-300)
-    p_value = chi2.sf(square, max(freedom, 1))
-    whole = np.sqrt(np.diag(np.linalg.inv(total + ridge)))[:own]
-    return Spread(p_value, off * np.sqrt(variance), whole)

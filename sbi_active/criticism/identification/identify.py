@@ -7,7 +7,6 @@ from collections.abc import Sequence
 
 import numpy as np
 import torch
-from scipy.stats import norm, rankdata
 from torch.distributions import Distribution
 
 from sbi_active.arrays import Array
@@ -16,16 +15,14 @@ from sbi_active.criticism.data.trials import Trials
 from sbi_active.criticism.effects.effect import Effect
 from sbi_active.criticism.effects.trial_conditions import conditions_for
 from sbi_active.criticism.evidence.fit import tempered
-from sbi_active.criticism.identification.fitting import Fitted, fitted, spread
+from sbi_active.criticism.identification.fitting import Fitted, fitted
 from sbi_active.criticism.identification.settings import IdentifySettings
+from sbi_active.criticism.identification.widening import opened, reflected, spread
 from sbi_active.expected import suggests
 from sbi_active.inference.beliefs.diagnostics import Diagnostics
 from sbi_active.inference.beliefs.weighted import KernelBelief
 from sbi_active.inference.engine.importance import pareto_shape
-from sbi_active.inference.sampling.weights import (
-    effective_sample_size,
-    scott,
-)
+from sbi_active.inference.sampling.weights import effective_sample_size, scott
 from sbi_active.seeding import derive_seed, forked_generators
 from sbi_active.simulation import GaussianNoise, SimulatorModel
 from sbi_active.threads import single_thread
@@ -91,7 +88,7 @@ def identify(
     (:mod:`..linear.processes`). Effects ``beside`` may be there or not, each with its
     own parameter (:mod:`.posterior`); fits follow where they are. Where single trials
     disagree all the same, the model lacks something else, and the belief is as wide as
-    their disagreement says (:mod:`.spread`). Where the likelihood is not that of a
+    their disagreement says (:mod:`.widening`). Where the likelihood is not that of a
     linear model, draws are weighed by the simulator.
 
     Args:
@@ -147,12 +144,12 @@ def identify(
     least = float(parts.p_value.min(initial=1.0))
     disagree = least * len(parts.p_value) < own.level
     if disagree:
-        u = _reflected(parts.widen(u, own.wider, rng), low, high)
+        u = reflected(parts.widen(u, own.wider, rng), low, high)
     names = model.parameter_names or [f"theta_{k + 1}" for k in range(u.shape[1])]
     sides = c.sides(u)
     for k in np.flatnonzero(sides):
         bound = (low if sides[k] < 0 else high)[k]
-        inside = _opened(sides[k] * (bound - u[:, k]), parts.sd[k], own.half)
+        inside = opened(sides[k] * (bound - u[:, k]), parts.sd[k], own.half)
         u[:, k] = bound - sides[k] * inside
     rest = np.broadcast_to(found.origin[u.shape[1] :], (len(u), c.dim - u.shape[1]))
     theta = c.to_z(np.concatenate([np.clip(u, low, high), rest], 1))[:, : u.shape[1]]
@@ -175,7 +172,7 @@ def identify(
             "nearly linear model; use Campaign, or a narrower prior"
         )
     notes += _at_bounds(belief)
-    errors = _errors(found, model)
+    errors, present = _errors(found, model), found.draws.present.mean(0).tolist()
     if known_sd is not None:
         notes += _beyond(found, errors, known_sd, own.beyond)
     belief.diagnostics = (
@@ -184,7 +181,7 @@ def identify(
         .extended(
             num_simulations=found.rival.simulator.num_simulations,
             effective_sample_size=effective,
-            beside=_beside(found),
+            beside=dict(zip(found.rival.key.effects, present, strict=True)),
             aliases=found.aliases,
             errors=errors,
             disagreement=dict(zip(names, parts.p_value.tolist(), strict=True)),
@@ -254,7 +251,7 @@ def _log_ratio(found: Fitted, at: Array) -> Array:
     """Return the log density of draws beside that of the linear model, (k,)."""
     u, m = found.draws.u[at], found.measurements
     true = found.rival.residual(found.origin + u)[0] / found.unit
-    model = found.model
+    model = found.model()
     linear = model.at(u)
     both = found.whitened(np.concatenate([true, linear]).T, 0 * m.trial)
     square = (both**2).sum(0)
@@ -264,18 +261,6 @@ def _log_ratio(found: Fitted, at: Array) -> Array:
     log_w = c.log_prob(np.clip(found.origin + u, c.low, c.high)) - gaussian
     log_w = log_w + 0.5 * (square[len(at) :] - square[: len(at)])
     return np.nan_to_num(log_w, nan=-1e9, neginf=-1e9, posinf=-1e9)
-
-
-def _reflected(u: Array, low: Array, high: Array) -> Array:
-    """Return draws that left the bounds as far inside of them."""
-    u = np.where(u < low, 2 * low - u, u)
-    u = np.where(u > high, 2 * high - u, u)
-    return np.clip(u, low, high)
-
-
-def _beside(found: Fitted) -> dict[str, float]:
-    share = found.draws.present.mean(0).tolist()
-    return {e.name: p for e, p in zip(found.rival.effects, share, strict=True)}
 
 
 def _errors(found: Fitted, model: SimulatorModel) -> dict[str, dict[str, float]]:
@@ -307,23 +292,6 @@ def _beyond(
             "close_loop what it lacks"
         )
     return notes
-
-
-def _opened(inside: Array, sd: float, half: float) -> Array:
-    """Return distances of draws from a bound, as half a Gaussian at least, (n,).
-
-    Where trials ask for what is far beyond it, the posterior within has no width, which
-    says nothing of the parameter.
-
-    Args:
-        inside: Distances from the bound, shape (n,).
-        sd: Deviation that the parameter has without bounds.
-        half: Share of it that is wide enough.
-    """
-    if inside.std() >= half * sd:
-        return inside
-    probability = (rankdata(inside, "ordinal") - 0.5) / len(inside)
-    return np.maximum(inside, sd * norm.ppf(0.5 + probability / 2))
 
 
 def _at_bounds(belief: IdentifiedBelief) -> list[str]:

@@ -27,11 +27,7 @@ from sbi_active.criticism.linear.model import LinearModel
 from sbi_active.criticism.results import NONE
 from sbi_active.criticism.steps.detection import log_prior, log_priors
 from sbi_active.inference.sampling.truncated import draws_between
-from sbi_active.inference.sampling.weights import (
-    log_sum_exp,
-    normalized,
-    systematic,
-)
+from sbi_active.inference.sampling.weights import log_sum_exp, normalized, systematic
 
 EffectSet = frozenset[int]
 
@@ -136,6 +132,6 @@ class Posterior:
             given = own.mean[error[at]], own.cov[error[at]]
             drawn = draws_between(*given, model.low[free], model.high[free], rng)
             u[np.ix_(at, free)], log_w[at] = drawn
-            present[np.ix_(at, [*one])] = True
+            present[at[:, None], [*one]] = True
         kept = systematic(normalized(log_w), num, float(rng.random()))
         return Draws(u[kept], present[kept])
