@@ -42,7 +42,8 @@ class ChannelErrors:
         grams: Gram matrices of a linear model's rows, by channel.
         known: Deviation of the white part of each channel, shape (c,); None if it is
             unknown, and as likely on any scale.
-        white: Prior probability that a channel's errors are white.
+        white: Prior probability that a channel's errors are white, one half for want of
+            anything better.
     """
 
     processes: Processes
@@ -104,8 +105,8 @@ class ChannelErrors:
             free: Coordinates that are not zero, shape (d,).
             num: Number of draws.
             rng: Source of the draws.
-            rounds: Times that errors and coordinates are found given the other; of a
-                few dozen hypotheses most are final at the third.
+            rounds: Times that errors and coordinates are found given the other. A place
+                that is not final costs draws of the errors, and no more.
         """
         u, cov, weight = np.zeros(len(free)), np.zeros((len(free),) * 2), model.sd**-2
         at, ends = np.ix_(free, free), (model.low[free], model.high[free])

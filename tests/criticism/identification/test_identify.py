@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import torch
 from sbi.utils import BoxUniform
+from scipy.special import logsumexp
 from scipy.stats import gamma, norm
 from scipy.stats import t as student_t
 from torch.distributions import Gamma, Independent
@@ -13,6 +14,7 @@ from sbi_active.criticism import Trials
 from sbi_active.criticism.identification import IdentifySettings, identify
 from sbi_active.criticism.identification.channels import ChannelErrors
 from sbi_active.criticism.identification.posterior import Posterior
+from sbi_active.criticism.linear.mixture import integrated
 from sbi_active.criticism.linear.model import LinearModel
 from sbi_active.criticism.linear.processes import Grams, Processes
 from sbi_active.criticism.results import ModelKey
@@ -107,6 +109,43 @@ def test_an_unknown_size_is_summed_out():
     sd = np.sqrt(cov[1, 1] * square / freedom)
     ends = best[1] + sd * student_t(freedom).ppf([0.025, 0.975])
     assert np.quantile(u, [0.025, 0.975]) == pytest.approx(ends, abs=0.1 * sd)
+
+
+@pytest.mark.parametrize("is_known", [True, False])
+def test_the_sum_over_draws_of_errors_is_that_over_all_of_them(is_known):
+    """Of two channels with three hypotheses each, by quadrature over their sizes."""
+    model, step = linear(num=40, sd=(3.0, 3.0, 1.0)), 0.02
+    apart = np.abs(np.subtract.outer(np.arange(20), np.arange(20)))
+    kernels = [np.eye(20), 0.7**apart, 0.3 * np.eye(20) + 0.7 * 0.9**apart]
+    rows = model.rows.reshape(2, 20, 4)
+    gram = np.stack([[r.T @ np.linalg.solve(k, r) for r in rows] for k in kernels])
+    log_det = np.stack([np.repeat(np.linalg.slogdet(k)[1], 2) for k in kernels])
+    white, ones = np.array([1.0, 0.0, 0.3]), np.ones(3)
+    processes = Processes(np.maximum(white, 0.1), 1 - white, ones, ones > 1)
+    known = np.array([0.6, 0.4]) if is_known else None
+    errors = ChannelErrors(processes, Grams(gram, log_det, np.full(2, 20)), known)
+    rng, every = np.random.default_rng(0), np.ones(3, bool)
+    drawn = errors.drawn(errors.places(model, every, 8, rng), 4096, rng)
+    found = Posterior(model, [], np.full(3, -1), *drawn, near=3.0)
+    # All of them: the variance of each hypothesis, or a fine grid over its logarithm.
+    sizes = np.zeros(1) if is_known else np.arange(-2.5, 2.5, step)
+    log_z = []
+    for h in np.ndindex(3, 3):
+        base = np.square(known) / processes.white[[*h]] if is_known else np.ones(2)
+        v = base * np.exp(np.stack(np.meshgrid(sizes, sizes), -1).reshape(-1, 2))
+        own = (gram[h, [0, 1]] / v[..., None, None]).sum(1)
+        prior = np.log(np.where(np.array(h) > 0, 0.25, 0.5)) - 0.5 * log_det[h, [0, 1]]
+        log_p = (prior - 10 * np.log(v)).sum(1) + integrated(own, model, (1.0,))[0][
+            :, 0
+        ]
+        log_z.append(logsumexp(log_p) + (0 if is_known else 2 * np.log(step)))
+    log_p = found.log_p[0] - np.log(0.5)  # of no effect
+    weight = np.exp(log_p - log_p.max())
+    error = weight.std() / weight.mean() / 64
+    assert logsumexp(log_p) - np.log(4096) == pytest.approx(
+        logsumexp(log_z), abs=4 * error
+    )
+    assert error < 0.05
 
 
 def test_bounds_hold():
