@@ -14,15 +14,14 @@ from sbi_active.criticism.checks import require_fitting
 from sbi_active.criticism.data.trials import Trials
 from sbi_active.criticism.effects.effect import Effect
 from sbi_active.criticism.effects.trial_conditions import conditions_for
-from sbi_active.criticism.evidence.fit import tempered
+from sbi_active.criticism.identification.bending import bends, sampled
 from sbi_active.criticism.identification.fitting import Fitted, fitted
 from sbi_active.criticism.identification.settings import IdentifySettings
 from sbi_active.criticism.identification.widening import opened, reflected, spread
 from sbi_active.expected import suggests
 from sbi_active.inference.beliefs.diagnostics import Diagnostics
 from sbi_active.inference.beliefs.weighted import KernelBelief
-from sbi_active.inference.engine.importance import pareto_shape
-from sbi_active.inference.sampling.weights import effective_sample_size, scott
+from sbi_active.inference.sampling.weights import scott
 from sbi_active.seeding import derive_seed, forked_generators
 from sbi_active.simulation import GaussianNoise, SimulatorModel
 from sbi_active.threads import single_thread
@@ -89,7 +88,7 @@ def identify(
     own parameter (:mod:`.posterior`); fits follow where they are. Where single trials
     disagree all the same, the model lacks something else, and the belief is as wide as
     their disagreement says (:mod:`.widening`). Where the likelihood is not that of a
-    linear model, draws are weighed by the simulator.
+    linear model, draws are of the simulator's own (:mod:`.bending`).
 
     Args:
         model: Simulator, deterministic but for the noise. The white part of the errors
@@ -137,7 +136,7 @@ def identify(
         *(model, prior, some, beside), known_sd=known_sd, seed=seed, settings=own
     )
     rng = np.random.default_rng(derive_seed(seed, "draws"))
-    u, effective, shape = _weighed(found, rng, own)
+    u, effective, shape = _sampled(found, rng, own)
     parts, c = spread(found, own.fewest_parts), found.rival.coordinates
     u = (found.origin + u)[:, : found.rival.theta_dim]
     low, high = c.low[: u.shape[1]], c.high[: u.shape[1]]
@@ -223,44 +222,26 @@ def _with_noise(
     return model, sd
 
 
-def _weighed(
+def _sampled(
     found: Fitted, rng: np.random.Generator, settings: IdentifySettings
 ) -> tuple[Array, float, float | None]:
-    """Return draws of u - origin, how many they count for, and the weights' tail.
+    """Return draws of u - origin, how many they count for, and their weights' tail.
 
-    Its shape is None if the model is linear. Of effects that were not fitted a chord
-    is all that is known: draws that have one are not compared with the simulator.
+    Its shape is None if the model is linear. If it bends, draws of the likeliest set of
+    effects are the simulator's; of the others' a chord may be all that is known.
     """
     own, draws = settings, found.draws
-    faint = draws.present.mean(0) <= own.likely
-    fit = np.flatnonzero(~(draws.present & faint).any(1))
-    order = rng.permutation(fit if len(fit) >= own.fewest_kept else len(draws.u))
-    log_w = _log_ratio(found, order[: own.num_compared])
-    if log_w.std() < own.linear:
+    sets, place = np.unique(draws.present, axis=0, return_inverse=True)
+    best = int(np.bincount(place).argmax())
+    at = rng.permutation(np.flatnonzero(place == best))
+    if not bends(found, at[: own.num_compared], own.linear):
         return draws.u.copy(), float(len(draws.u)), None
-    some = order[: own.num_weighed]
-    log_w = _log_ratio(found, some)
-    effective = effective_sample_size(log_w)
+    fit, u = sampled(found, sets[best], rng, own.most_simulated), draws.u.copy()
     # Few draws would make for a narrow interval: rather that of the linear model.
-    u, p = draws.u.copy(), tempered(log_w, own.fewest_kept)
-    u[order] = u[rng.choice(some, size=len(order), p=p)]
-    return u, effective, pareto_shape(log_w)
-
-
-def _log_ratio(found: Fitted, at: Array) -> Array:
-    """Return the log density of draws beside that of the linear model, (k,)."""
-    u, m = found.draws.u[at], found.measurements
-    true = found.rival.residual(found.origin + u)[0] / found.unit
-    model = found.model()
-    linear = model.at(u)
-    both = found.whitened(np.concatenate([true, linear]).T, 0 * m.trial)
-    square = (both**2).sum(0)
-    c = found.rival.coordinates
-    gaussian = -0.5 * (((u - model.center) / model.sd) ** 2).sum(1)
-    # At a bound, where absent effects stand, rounding would be outside.
-    log_w = c.log_prob(np.clip(found.origin + u, c.low, c.high)) - gaussian
-    log_w = log_w + 0.5 * (square[len(at) :] - square[: len(at)])
-    return np.nan_to_num(log_w, nan=-1e9, neginf=-1e9, posinf=-1e9)
+    if fit.effective_sample_size >= own.fewest:
+        free = np.append(sets[best], True)[found.effect]
+        u[np.ix_(at, free)] = fit.draws(len(at), rng) - found.origin[free]
+    return u, fit.effective_sample_size, fit.tail_shape
 
 
 def _errors(found: Fitted, model: SimulatorModel) -> dict[str, dict[str, float]]:

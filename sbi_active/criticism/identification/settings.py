@@ -47,15 +47,13 @@ class IdentifySettings:
             half misses three of four posteriors of six parameters that are off by .6
             standard deviations.
         linear: Deviation of the log density ratio up to which it will do, nats.
-        num_weighed: Draws that are weighed where it will not.
-        fewest: Effective draws below which a belief whose draws are weighed is not to
-            be trusted.
+        most_simulated: Simulations of all trials that are spent where it will not.
+        fewest: Effective draws of these below which a belief rests on the linear model,
+            and is not to be trusted: few would make for a narrow interval.
         fewest_each: Effective draws as a multiple of d (d + 3) for d parameters, below
             which such a belief is not to be trusted, as for other beliefs.
         largest_shape: Shape of the tail of weights above which it is not either, as for
-            other beliefs: the linear model lacks places that the simulator explains.
-        fewest_kept: Effective draws that weights leave at least: few would make for a
-            narrow interval.
+            other beliefs.
         fewest_parts: Parts of the trials at least, for which trials are divided in
             time.
         level: Tail probability below which they disagree.
@@ -88,11 +86,10 @@ class IdentifySettings:
     least: float = 1e-12
     num_compared: int = 16
     linear: float = 0.5
-    num_weighed: int = 400
-    fewest: int = 50
+    most_simulated: int = 3_000
+    fewest: int = 100
     fewest_each: float = 2.5
     largest_shape: float = 0.7
-    fewest_kept: int = 100
     fewest_parts: int = 4
     level: float = 0.01
     wider: float = 3.0
