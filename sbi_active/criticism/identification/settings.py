@@ -43,10 +43,10 @@ class IdentifySettings:
         shares: Shares of the variance that are white, of errors of unknown size.
         least: Smallest share of a declared white error: below it sums of squares lose
             their digits.
-        num_compared: Draws at which the linear model is compared with the simulator:
-            half misses three of four posteriors of six parameters that are off by .6
-            standard deviations.
-        linear: Deviation of the log density ratio up to which it will do, nats.
+        num_compared: Draws at which the linear model is compared with the simulator.
+        linear: Deviation of the log density ratio up to which it will do, nats: models
+            that are linear have .1 at most, and half a nat misses one of eight
+            posteriors of six parameters whose means are off by .6 deviations.
         most_simulated: Simulations of all trials that are spent where it will not.
         fewest: Effective draws of these below which a belief rests on the linear model,
             and is not to be trusted: few would make for a narrow interval.
@@ -85,7 +85,7 @@ class IdentifySettings:
     shares: tuple[float, ...] = (1e-4, 1e-3, 0.01, 0.03, 0.1, 0.3, 0.6, 0.9)
     least: float = 1e-12
     num_compared: int = 16
-    linear: float = 0.5
+    linear: float = 0.25
     most_simulated: int = 3_000
     fewest: int = 100
     fewest_each: float = 2.5
