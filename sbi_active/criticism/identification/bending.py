@@ -44,8 +44,8 @@ class SettledError:
         return self.linear.whitened(rows.T, 0 * trial).T.reshape(residual.shape)
 
     def log_likelihood(self, residual: Array) -> Array:
-        """Return log likelihoods but for a constant, (n, N) -> (n,)."""
-        return -0.5 * (self.start(residual) ** 2).sum(1)
+        """Return log likelihoods but for a constant, (..., N) -> (...)."""
+        return -0.5 * (self.start(residual) ** 2).sum(-1)
 
 
 def bends(linear: Fitted, at: NDArray[np.int64], most: float) -> bool:
@@ -58,10 +58,10 @@ def bends(linear: Fitted, at: NDArray[np.int64], most: float) -> bool:
     """
     error, model, c = SettledError(linear), linear.model(), linear.rival.coordinates
     u = linear.draws.u[at]
-    log_p = error.log_likelihood(linear.rival.residual(linear.origin + u)[0])
+    left = linear.rival.residual(linear.origin + u)[0], linear.unit * model.at(u)
+    log_p, log_q = error.log_likelihood(np.stack(left))
     # At a bound, where absent effects stand, rounding would be outside.
     log_p = log_p + c.log_prob(np.clip(linear.origin + u, c.low, c.high))
-    log_q = error.log_likelihood(linear.unit * model.at(u))
     log_q = log_q - 0.5 * (((u - model.center) / model.sd) ** 2).sum(1)
     return not (log_p - log_q).std() < most  # NaN: not simulated
 
