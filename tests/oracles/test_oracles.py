@@ -35,7 +35,7 @@ QUICK = {
         *("linear_3_10", "linear_10_4", "numerical", "oscillator", "compartments_6"),
         *("eight_modes", "banana", "jump", "edge", "student", "missing", "invalid"),
     ),
-    "identify": ("decay", "missing"),
+    "identify": ("compartments_6", "decay", "missing"),
 }
 #: Posteriors of several modes or with a curved ridge, whose normal fits vary by the
 #: seed by a tenth of a nat: the median of so many seeds is judged.

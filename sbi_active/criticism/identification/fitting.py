@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import compress
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
 from torch.distributions import Distribution
 
 from sbi_active.arrays import Array
@@ -15,7 +15,8 @@ from sbi_active.criticism.data.measurements import Measurements
 from sbi_active.criticism.data.trials import Trials
 from sbi_active.criticism.effects.augmented import AugmentedSimulator
 from sbi_active.criticism.effects.effect import Effect
-from sbi_active.criticism.identification.posterior import TINY, Draws, Sampler, Unknowns
+from sbi_active.criticism.identification.channels import TINY, ChannelErrors
+from sbi_active.criticism.identification.posterior import Draws, Posterior
 from sbi_active.criticism.identification.settings import IdentifySettings
 from sbi_active.criticism.linear.fits import best_fit, polished
 from sbi_active.criticism.linear.model import (
@@ -26,7 +27,7 @@ from sbi_active.criticism.linear.model import (
     enlarged,
     linearize,
 )
-from sbi_active.criticism.linear.processes import Filters, Processes, parts_of, whitened
+from sbi_active.criticism.linear.processes import Filters, whitened
 from sbi_active.criticism.results import ModelKey
 from sbi_active.criticism.rivals.error_models import NoiseCell, NoiseGrid
 from sbi_active.criticism.rivals.rival import Rival
@@ -44,18 +45,18 @@ class Linear:
         effect: Number of the effect that a coordinate belongs to, -1 for none, (d,).
         null: Values at which effects vanish, shape (d,); NaN for other coordinates.
         unit: Root mean square residual of each number's channel, shape (N,).
-        model: Linear model, in units.
+        fit: Linear model, in units, where it was fitted.
     """
 
     rival: Rival
     effect: NDArray[np.int64]
     null: Array
     unit: Array
-    model: LinearModel
+    fit: LinearModel
 
     def around(
         self,
-        model: LinearModel,
+        fit: LinearModel,
         free: NDArray[np.bool_],
         unit: Array,
         tried: float | None = None,
@@ -63,58 +64,54 @@ class Linear:
         """Return the linear model around a fit of some of the effects.
 
         Args:
-            model: Linear model in units, without the others.
+            fit: Linear model in units, without the others.
             free: Coordinates of that model, shape (d,).
             unit: Units of the residuals, shape (N,).
             tried: Deviations of the prior by which the others are tried anew: by a
                 chord, since many are flat at their null.
         """
         at = np.array(self.null)
-        at[free] = model.u
+        at[free] = fit.u
         if tried is None:
-            columns = self.model.jacobian[:, ~free]
+            columns = self.fit.jacobian[:, ~free]
         else:
-            columns = chords(self.rival, at, ~free, tried, model, unit)
-        full = enlarged(model, self.rival, ~free, at[~free], columns)
-        return replace(self, unit=unit, model=full)
+            columns = chords(self.rival, at, ~free, tried, fit, unit)
+        full = enlarged(fit, self.rival, ~free, at[~free], columns)
+        return replace(self, unit=unit, fit=full)
 
-    def of(self, rival: Rival, bare: LinearModel) -> Linear:
-        """Return the linear model with some of its effects.
+    def without(self, kept: NDArray[np.bool_]) -> Linear:
+        """Return the linear model without some of its effects.
 
         Args:
-            rival: Rival with those effects.
-            bare: Linear model in units, without any.
+            kept: Mask of those that it keeps, shape (e,).
         """
-        kept = [e in rival.effects for e in self.rival.effects]
         at = np.append(kept, True)[self.effect]
-        effect, null = (
-            np.append(np.cumsum(kept) - 1, -1)[self.effect[at]],
-            self.null[at],
+        number = np.append(np.cumsum(kept) - 1, -1)
+        return replace(
+            self,
+            rival=with_effects(self.rival, [*compress(self.rival.effects, kept)]),
+            effect=number[self.effect[at]],
+            null=self.null[at],
+            fit=self.fit.part(at),
         )
-        new = effect >= 0
-        columns = self.model.jacobian[:, at][:, new]
-        model = enlarged(bare, rival, new, null[new], columns)
-        return replace(self, rival=rival, effect=effect, null=null, model=model)
 
     @property
     def origin(self) -> Array:
         """Point of linearization, with effects at their null, shape (d,)."""
-        return np.where(self.effect < 0, self.model.u, self.null)
+        return np.where(self.effect < 0, self.fit.u, self.null)
 
-    @property
-    def rows(self) -> Array:
-        """Residual at the origin and its derivatives, in units, shape (N, 1 + d)."""
-        j = self.model.jacobian
-        r = self.model.residual + j @ (self.origin - self.model.u)
-        return np.concatenate([r[:, None], j], 1)
+    def model(self, *, flat: float = 100.0) -> LinearModel:
+        """Return the linear model at the origin, from which coordinates count.
 
-    @property
-    def unknowns(self) -> Unknowns:
-        """Prior knowledge of u - ``origin``."""
-        c, at = self.rival.coordinates, self.origin
-        is_flat = (self.effect >= 0) & (c.precision == 0)
-        precision = np.where(is_flat, 1.0, c.precision)
-        return Unknowns(c.low - at, c.high - at, c.center - at, precision, self.effect)
+        Args:
+            flat: Deviation of the Gaussian that stands for a flat prior, in units of
+                its range: it leaves the prior as it is, and directions that nothing
+                tells solvable.
+        """
+        fit, origin = self.fit, self.origin
+        model = replace(fit, u=origin, residual=fit.at(origin[None])[0]).from_here()
+        is_flat = (self.effect < 0) & (self.rival.coordinates.precision == 0)
+        return replace(model, sd=np.where(is_flat, flat * (fit.high - fit.low), fit.sd))
 
     @property
     def sizes(self) -> Array:
@@ -132,12 +129,12 @@ class Fitted(Linear):
     """A linear model with posterior draws.
 
     Attributes:
-        errors: Hypotheses of the errors.
+        errors: Errors of each channel.
         draws: Draws of u - ``origin``.
         aliases: Effects that are left out since parameters do the same.
     """
 
-    errors: Processes
+    errors: ChannelErrors
     draws: Draws
     aliases: tuple[str, ...]
 
@@ -148,14 +145,26 @@ class Fitted(Linear):
             rows: Rows in units.
             fold: Part of each number, shape (N,), with errors of its own.
         """
-        m, draws = self.measurements, self.draws
-        chosen = np.array([np.bincount(h).argmax() for h in draws.errors.T])
-        size = [
-            np.sqrt(np.mean(own[h == best] ** 2))
-            for own, h, best in zip(draws.size.T, draws.errors.T, chosen, strict=True)
-        ]
-        white = whitened(rows, self.errors, m, chosen, fold)
-        return white / np.array(size)[m.channel, None]
+        m, own = self.measurements, self.errors
+        shape, variance = own.likeliest(self.draws.u.mean(0))
+        white = whitened(rows, own.processes, m, shape, fold)
+        return white / np.sqrt(variance)[m.channel, None]
+
+    def off(self, u: Array, free: NDArray[np.bool_]) -> Array:
+        """Return how far the simulator at a place would move it, in deviations, (k,).
+
+        Args:
+            u: Mean of the posterior, shape (d,).
+            free: Coordinates that may move, shape (d,).
+        """
+        c, fit = self.rival.coordinates, self.fit
+        bent = self.rival.residual(u[None])[0][0] / self.unit - fit.at(u[None])[0]
+        rows = np.concatenate([bent[:, None], fit.rows[:, 1:][:, free]], 1)
+        white = self.whitened(rows, 0 * self.measurements.trial)
+        slope, precision = white[:, 1:], np.diag(self.model().sd[free] ** -2)
+        step = np.linalg.solve(slope.T @ slope + precision, slope.T @ white[:, 0])
+        move = np.clip(u[free] + step, c.low[free], c.high[free]) - u[free]
+        return np.abs(move) / (self.draws.u.std(0)[free] + self.rival.step)
 
 
 def fitted(
@@ -181,43 +190,62 @@ def fitted(
     """
     own, rng = settings, np.random.default_rng(seed)
     bare = _bare(model, prior, trials, beside, own, seed)
-    doubtful = [e for e in beside if e.scope == "campaign"]
     fit, unit = _searched(bare, own, seed)
-    linear = _beside(_with(bare, doubtful), fit, unit, own)
-    told, aliases = _told(linear, own.alias)
-    if len(told) < len(doubtful):
-        doubtful = told
-        linear = linear.of(_with(bare, told), fit)
+    doubtful = [e for e in beside if e.scope == "campaign"]
+    linear, aliases = _beside(with_effects(bare, doubtful), fit, unit, own)
     m, c = linear.measurements, linear.rival.coordinates
     share = 1.0 if known_sd is None else ((known_sd[m.channel] / unit) ** 2).min()
-    errors = own.errors(m, float(share))
-    filters = Filters(errors, m, 0 * m.trial, m.channel)
-    there, some = np.zeros(len(doubtful), dtype=bool), bare
-    for again in range(own.linearized):
-        known: list[float | None] = [None] * filters.num_groups
-        if known_sd is not None:
-            known = [*(known_sd / linear.sizes)]
-        given = filters.grams(linear.rows), errors, linear.unknowns, known, rng
-        sampler = Sampler(*given, own.sampler)
-        draws = sampler.draws(own.sampler.few)
+    filters = Filters(own.errors(m, float(share)), m, 0 * m.trial, m.channel)
+    there, again = np.zeros(len(linear.rival.effects), dtype=bool), own.linearized
+    while True:
+        errors = ChannelErrors(
+            processes=filters.processes,
+            grams=filters.grams(linear.model().rows),
+            known=None if known_sd is None else known_sd / linear.sizes,
+        )
+        draws = _posterior(linear, errors, own, rng).draws(own.num_draws, rng)
+        found = Fitted(**vars(linear), errors=errors, draws=draws, aliases=aliases)
         before, there = there, draws.present.mean(0) > own.likely
-        free = np.append(there, True)[linear.effect]
+        free, is_new = np.append(there, True)[linear.effect], (there != before).any()
         u = linear.origin + np.where(free, draws.u.mean(0), 0.0)
-        u, is_new = np.clip(u, c.low, c.high), bool((there != before).any())
-        move = np.abs(u - linear.model.u) / (draws.u.std(0) + own.step)
-        is_near = not is_new and move.max() < own.moved
-        if is_near or again == own.linearized - 1:
-            break
+        u, again = np.clip(u, c.low, c.high), again - 1
+        if not again or not (is_new or found.off(u, free).max() > own.moved):
+            return found
+        some = with_effects(bare, [*compress(linear.rival.effects, there)])
         if is_new:
-            some = _with(bare, [e for e, k in zip(doubtful, there, strict=True) if k])
-            fit, unit = _settled(some, u[free], linear.unit, own)
-            linear = linear.around(fit, free, unit, own.tried)
+            fit, unit = _settled(some, u[free], own)
         else:
-            fit = linearize(some, u[free], linear.unit)
-            fit = centered(some, fit, linear.unit)
-            linear = linear.around(fit, free, linear.unit)
-    draws = sampler.draws(own.sampler.many)
-    return Fitted(**vars(linear), errors=errors, draws=draws, aliases=aliases)
+            fit = centered(some, linearize(some, u[free], unit), unit)
+        linear = linear.around(fit, free, unit, own.tried if is_new else None)
+
+
+def _posterior(
+    linear: Linear,
+    errors: ChannelErrors,
+    settings: IdentifySettings,
+    rng: np.random.Generator,
+) -> Posterior:
+    """Return the posterior of a linear model.
+
+    Errors are drawn by what is left with no effect and with all of them, and then by
+    what the posterior given these leaves.
+
+    Args:
+        linear: The linear model.
+        errors: Errors of its rows.
+        settings: Settings of what is spent.
+        rng: Source of the draws.
+    """
+    own, model, effects = settings, linear.model(), linear.rival.effects
+    every = linear.effect < 0, np.ones(len(linear.effect), dtype=bool)
+    places = [errors.places(model, free, own.num_places, rng) for free in every]
+
+    def given() -> Posterior:
+        drawn = errors.drawn(np.concatenate(places), own.num_errors, rng)
+        return Posterior(model, effects, linear.effect, *drawn, own.near)
+
+    places.append(given().draws(own.num_places, rng).u)
+    return given()
 
 
 def _bare(
@@ -260,10 +288,10 @@ def _bare(
     )
 
 
-def _with(bare: Rival, effects: Sequence[Effect]) -> Rival:
-    """Return a rival with some effects."""
+def with_effects(rival: Rival, effects: Sequence[Effect]) -> Rival:
+    """Return a rival with these effects."""
     key = ModelKey(tuple(e.name for e in effects))
-    return replace(bare, key=key, effects=effects)
+    return replace(rival, key=key, effects=effects)
 
 
 def _searched(
@@ -283,21 +311,15 @@ def _searched(
         num_starts=max(fit.num_starts, round(own.starts_each * dim)),
         num_kept=max(fit.num_kept, round(own.kept_each * dim)),
     )
-    return _settled(bare, best_fit(bare, u, unit, fit).u, unit, own)
+    return _settled(bare, best_fit(bare, u, unit, fit).u, own)
 
 
 def _settled(
-    rival: Rival, u: Array, unit: Array, settings: IdentifySettings
+    rival: Rival, u: Array, settings: IdentifySettings
 ) -> tuple[LinearModel, Array]:
-    """Return a best fit in which every channel is weighed by its own residual."""
-    model = polished(rival, u, unit, settings.fit)
-    for _ in range(settings.rounds):
-        sizes = _sizes(rival, model.residual * unit, settings)
-        if np.log(unit / sizes).mean() < settings.worth:
-            break
-        unit = sizes
-        model = polished(rival, model.u, unit, settings.fit)
-    return model, unit
+    """Return a best fit that weighs each channel by its residual at the start."""
+    unit = _sizes(rival, rival.residual(u[None])[0][0], settings)
+    return polished(rival, u, unit, settings.fit), unit
 
 
 def _sizes(rival: Rival, residual: Array, settings: IdentifySettings) -> Array:
@@ -309,88 +331,29 @@ def _sizes(rival: Rival, residual: Array, settings: IdentifySettings) -> Array:
 
 def _beside(
     whole: Rival, bare: LinearModel, unit: Array, settings: IdentifySettings
-) -> Linear:
-    """Return a model with effects that are absent so far, at the fit without."""
-    columns, effect = whole.coordinates.places, np.full(whole.dim, -1)
-    null = np.full(whole.dim, np.nan)
-    for k, own in enumerate(whole.effects):
-        effect[columns[own.name]] = k
-        null[effect == k] = at_null(whole, own, settings.tried)[0]
-    found = Linear(whole, effect, null, unit, bare)
-    return found.around(bare, effect < 0, unit, settings.tried)
+) -> tuple[Linear, tuple[str, ...]]:
+    """Return a model with effects that are absent so far, and what parameters imitate.
 
-
-def _told(found: Linear, least: float) -> tuple[list[Effect], tuple[str, ...]]:
-    """Return the effects that no change of the parameters imitates, and the others.
-
-    Those that change nothing are neither.
-    """
-    jacobian, effect = found.model.jacobian, found.effect
-    basis = basis_of(jacobian[:, effect < 0])
-    left = jacobian - basis @ (basis.T @ jacobian)
-    own, whole = (
-        np.sqrt(np.bincount(effect + 1, (part**2).sum(0))[1:])
-        for part in (left, jacobian)
-    )
-    effects, is_told = found.rival.effects, own > least * whole
-    is_alias = ~is_told & (whole > 0)
-    aliases = [e.name for e, alias in zip(effects, is_alias, strict=True) if alias]
-    told = [e for e, own in zip(effects, is_told, strict=True) if own]
-    return told, (*aliases,)
-
-
-@dataclass(frozen=True)
-class Spread:
-    """The disagreement between parts of the trials.
-
-    Attributes:
-        p_value: p-value of each parameter being the same in all parts, shape (d,).
-        deviation: Deviation of the parts from their mean, as far as it is none of their
-            errors, shape (f, d), such that normal multiples of them add up to the
-            spread.
-        sd: Standard deviation of each parameter by all trials if it had no bounds,
-            shape (d,).
-    """
-
-    p_value: Array
-    deviation: Array
-    sd: Array
-
-    def widen(self, u: Array, by: float, rng: np.random.Generator) -> Array:
-        """Return draws (n, d) as far off as the parts are from each other, times by."""
-        weight = rng.standard_normal((len(u), len(self.deviation)))
-        return u + by * weight @ self.deviation
-
-
-def spread(found: Fitted, fewest: int) -> Spread:
-    """Return the disagreement of parts of the trials about theta.
+    Those and what changes nothing are left out.
 
     Args:
-        found: The model, linear.
-        fewest: Number of parts at least.
+        whole: Rival with all effects.
+        bare: Fit without any.
+        unit: Units of the residuals, shape (N,).
+        settings: Settings of what is told apart.
     """
-    draws, m, own = found.draws, found.measurements, found.rival.theta_dim
-    likely = np.append(draws.present.mean(0) > 0.5, True)
-    free = (found.rival.coordinates.trial_of() < 0) & likely[found.effect]
-    parts = parts_of(m, fewest, fewest)
-    white = found.whitened(found.rows[:, np.append(True, free)], parts)
-    each = [white[parts == f] for f in range(int(parts.max()) + 1)]
-    grams = np.stack([rows.T @ rows for rows in each])
-    precision, linear = grams[:, 1:, 1:], -grams[:, 1:, 0]
-    total = precision.sum(0)
-    ridge = np.diag(1e-6 * np.diag(total) + 1e-12)
-    best = np.linalg.solve(total + ridge, linear.sum(0))
-    cov = np.linalg.inv(precision + ridge)
-    each = best + np.einsum("fij,fj->fi", cov, linear - precision @ best)
-    each, sd = each[:, :own], np.sqrt(np.einsum("fii->fi", cov))[:, :own]
-    weight = 1 / sd**2
-    mean = (weight * each).sum(0) / weight.sum(0)
-    square, freedom = (weight * (each - mean) ** 2).sum(0), len(each) - 1
-    of_parts = weight.sum(0) - (weight**2).sum(0) / weight.sum(0)
-    variance = np.maximum(square - freedom, 0.0) / np.maximum(of_parts, 1e-300)
-    # Deviations that are far off by their errors count less.
-    off = np.sqrt(weight) * (each - mean)
-    off = off / np.maximum(np.linalg.norm(off, axis=0), 1e-300)
-    p_value = chi2.sf(square, max(freedom, 1))
-    whole = np.sqrt(np.diag(np.linalg.inv(total + ridge)))[:own]
-    return Spread(p_value, off * np.sqrt(variance), whole)
+    own, effect, null = settings, np.full(whole.dim, -1), np.full(whole.dim, np.nan)
+    for k, e in enumerate(whole.effects):
+        effect[whole.coordinates.places[e.name]] = k
+        null[effect == k] = at_null(whole, e, own.tried)[0]
+    found = Linear(whole, effect, null, unit, bare)
+    found = found.around(bare, effect < 0, unit, own.tried)
+    jacobian, basis = found.fit.jacobian, basis_of(bare.jacobian)
+    left = jacobian - basis @ (basis.T @ jacobian)
+    apart, size = (
+        np.sqrt(np.bincount(effect + 1, (part**2).sum(0), len(whole.effects) + 1))[1:]
+        for part in (left, jacobian)
+    )
+    told = apart > own.alias * size
+    aliases = compress(whole.effects, ~told & (size > 0))
+    return found.without(told), tuple(e.name for e in aliases)

@@ -7,7 +7,6 @@ from collections.abc import Sequence
 
 import numpy as np
 import torch
-from scipy.stats import norm, rankdata
 from torch.distributions import Distribution
 
 from sbi_active.arrays import Array
@@ -15,17 +14,14 @@ from sbi_active.criticism.checks import require_fitting
 from sbi_active.criticism.data.trials import Trials
 from sbi_active.criticism.effects.effect import Effect
 from sbi_active.criticism.effects.trial_conditions import conditions_for
-from sbi_active.criticism.evidence.fit import tempered
-from sbi_active.criticism.identification.fitting import Fitted, fitted, spread
+from sbi_active.criticism.identification.bending import bends, sampled
+from sbi_active.criticism.identification.fitting import Fitted, fitted
 from sbi_active.criticism.identification.settings import IdentifySettings
+from sbi_active.criticism.identification.widening import opened, reflected, spread
 from sbi_active.expected import suggests
 from sbi_active.inference.beliefs.diagnostics import Diagnostics
 from sbi_active.inference.beliefs.weighted import KernelBelief
-from sbi_active.inference.engine.importance import pareto_shape
-from sbi_active.inference.sampling.weights import (
-    effective_sample_size,
-    scott,
-)
+from sbi_active.inference.sampling.weights import scott
 from sbi_active.seeding import derive_seed, forked_generators
 from sbi_active.simulation import GaussianNoise, SimulatorModel
 from sbi_active.threads import single_thread
@@ -91,8 +87,8 @@ def identify(
     (:mod:`..linear.processes`). Effects ``beside`` may be there or not, each with its
     own parameter (:mod:`.posterior`); fits follow where they are. Where single trials
     disagree all the same, the model lacks something else, and the belief is as wide as
-    their disagreement says (:mod:`.spread`). Where the likelihood is not that of a
-    linear model, draws are weighed by the simulator.
+    their disagreement says (:mod:`.widening`). Where the likelihood is not that of a
+    linear model, draws are of the simulator's own (:mod:`.bending`).
 
     Args:
         model: Simulator, deterministic but for the noise. The white part of the errors
@@ -140,19 +136,19 @@ def identify(
         *(model, prior, some, beside), known_sd=known_sd, seed=seed, settings=own
     )
     rng = np.random.default_rng(derive_seed(seed, "draws"))
-    u, effective, shape = _weighed(found, rng, own)
+    u, effective, shape = _sampled(found, rng, own)
     parts, c = spread(found, own.fewest_parts), found.rival.coordinates
     u = (found.origin + u)[:, : found.rival.theta_dim]
     low, high = c.low[: u.shape[1]], c.high[: u.shape[1]]
     least = float(parts.p_value.min(initial=1.0))
     disagree = least * len(parts.p_value) < own.level
     if disagree:
-        u = _reflected(parts.widen(u, own.wider, rng), low, high)
+        u = reflected(parts.widen(u, own.wider, rng), low, high)
     names = model.parameter_names or [f"theta_{k + 1}" for k in range(u.shape[1])]
     sides = c.sides(u)
     for k in np.flatnonzero(sides):
         bound = (low if sides[k] < 0 else high)[k]
-        inside = _opened(sides[k] * (bound - u[:, k]), parts.sd[k], own.half)
+        inside = opened(sides[k] * (bound - u[:, k]), parts.sd[k], own.half)
         u[:, k] = bound - sides[k] * inside
     rest = np.broadcast_to(found.origin[u.shape[1] :], (len(u), c.dim - u.shape[1]))
     theta = c.to_z(np.concatenate([np.clip(u, low, high), rest], 1))[:, : u.shape[1]]
@@ -175,7 +171,7 @@ def identify(
             "nearly linear model; use Campaign, or a narrower prior"
         )
     notes += _at_bounds(belief)
-    errors = _errors(found, model)
+    errors, present = _errors(found, model), found.draws.present.mean(0).tolist()
     if known_sd is not None:
         notes += _beyond(found, errors, known_sd, own.beyond)
     belief.diagnostics = (
@@ -184,7 +180,7 @@ def identify(
         .extended(
             num_simulations=found.rival.simulator.num_simulations,
             effective_sample_size=effective,
-            beside=_beside(found),
+            beside=dict(zip(found.rival.key.effects, present, strict=True)),
             aliases=found.aliases,
             errors=errors,
             disagreement=dict(zip(names, parts.p_value.tolist(), strict=True)),
@@ -226,68 +222,37 @@ def _with_noise(
     return model, sd
 
 
-def _weighed(
+def _sampled(
     found: Fitted, rng: np.random.Generator, settings: IdentifySettings
 ) -> tuple[Array, float, float | None]:
-    """Return draws of u - origin, how many they count for, and the weights' tail.
+    """Return draws of u - origin, how many they count for, and their weights' tail.
 
-    Its shape is None if the model is linear. Of effects that were not fitted a chord
-    is all that is known: draws that have one are not compared with the simulator.
+    Its shape is None if the model is linear. If it bends, draws of the likeliest set of
+    effects are the simulator's; of the others' a chord may be all that is known.
     """
     own, draws = settings, found.draws
-    faint = draws.present.mean(0) <= own.likely
-    fit = np.flatnonzero(~(draws.present & faint).any(1))
-    order = rng.permutation(fit if len(fit) >= own.fewest_kept else len(draws.u))
-    log_w = _log_ratio(found, order[: own.num_compared])
-    if log_w.std() < own.linear:
+    sets, place = np.unique(draws.present, axis=0, return_inverse=True)
+    best = int(np.bincount(place).argmax())
+    at = rng.permutation(np.flatnonzero(place == best))
+    if not bends(found, at[: own.num_compared], own.linear):
         return draws.u.copy(), float(len(draws.u)), None
-    some = order[: own.num_weighed]
-    log_w = _log_ratio(found, some)
-    effective = effective_sample_size(log_w)
+    fit, u = sampled(found, sets[best], rng, own.most_simulated), draws.u.copy()
     # Few draws would make for a narrow interval: rather that of the linear model.
-    u, p = draws.u.copy(), tempered(log_w, own.fewest_kept)
-    u[order] = u[rng.choice(some, size=len(order), p=p)]
-    return u, effective, pareto_shape(log_w)
-
-
-def _log_ratio(found: Fitted, at: Array) -> Array:
-    """Return the log density of draws beside that of the linear model, (k,)."""
-    u, m = found.draws.u[at], found.measurements
-    true = found.rival.residual(found.origin + u)[0] / found.unit
-    rows = found.rows
-    linear = rows[:, 0] + u @ rows[:, 1:].T
-    both = found.whitened(np.concatenate([true, linear]).T, 0 * m.trial)
-    square = (both**2).sum(0)
-    p, c = found.unknowns, found.rival.coordinates
-    gaussian = -0.5 * (p.precision * (u - p.center) ** 2).sum(1)
-    # At a bound, where absent effects stand, rounding would be outside.
-    log_w = c.log_prob(np.clip(found.origin + u, c.low, c.high)) - gaussian
-    log_w = log_w + 0.5 * (square[len(at) :] - square[: len(at)])
-    return np.nan_to_num(log_w, nan=-1e9, neginf=-1e9, posinf=-1e9)
-
-
-def _reflected(u: Array, low: Array, high: Array) -> Array:
-    """Return draws that left the bounds as far inside of them."""
-    u = np.where(u < low, 2 * low - u, u)
-    u = np.where(u > high, 2 * high - u, u)
-    return np.clip(u, low, high)
-
-
-def _beside(found: Fitted) -> dict[str, float]:
-    share = found.draws.present.mean(0).tolist()
-    return {e.name: p for e, p in zip(found.rival.effects, share, strict=True)}
+    if fit.effective_sample_size >= own.fewest:
+        free = np.append(sets[best], True)[found.effect]
+        u[np.ix_(at, free)] = fit.draws(len(at), rng) - found.origin[free]
+    return u, fit.effective_sample_size, fit.tail_shape
 
 
 def _errors(found: Fitted, model: SimulatorModel) -> dict[str, dict[str, float]]:
-    """Return the errors of each channel, as posterior medians."""
-    draws, known, said = found.draws, found.errors, {}
-    names = model.channel_names
-    for c, unit in enumerate(found.sizes.tolist()):
-        h = draws.errors[:, c]
+    """Return the likeliest errors of each channel."""
+    known, names, said = found.errors.processes, model.channel_names, {}
+    each = zip(*found.errors.likeliest(found.draws.u.mean(0)), strict=True)
+    for c, (h, variance) in enumerate(each):
         said[names[c] if names else f"channel {c}"] = {
-            "sd": unit * float(np.median(draws.size[:, c])),
-            "white": float(np.median(known.white[h])),
-            "time": float(np.median(np.where(h > 0, known.time[h], 0.0))),
+            "sd": float(found.sizes[c] * variance**0.5),
+            "white": float(known.white[h]),
+            "time": float(known.time[h] if h > 0 else 0.0),
         }
     return said
 
@@ -308,23 +273,6 @@ def _beyond(
             "close_loop what it lacks"
         )
     return notes
-
-
-def _opened(inside: Array, sd: float, half: float) -> Array:
-    """Return distances of draws from a bound, as half a Gaussian at least, (n,).
-
-    Where trials ask for what is far beyond it, the posterior within has no width, which
-    says nothing of the parameter.
-
-    Args:
-        inside: Distances from the bound, shape (n,).
-        sd: Deviation that the parameter has without bounds.
-        half: Share of it that is wide enough.
-    """
-    if inside.std() >= half * sd:
-        return inside
-    probability = (rankdata(inside, "ordinal") - 0.5) / len(inside)
-    return np.maximum(inside, sd * norm.ppf(0.5 + probability / 2))
 
 
 def _at_bounds(belief: IdentifiedBelief) -> list[str]:

@@ -12,30 +12,6 @@ from sbi_active.criticism.linear.processes import Processes, time_scales
 
 
 @dataclass(frozen=True, kw_only=True)
-class SamplerSettings:
-    """Numbers of draws, and priors of doubtful effects and of errors.
-
-    Attributes:
-        chains: Independent ones, side by side.
-        burnt: Sweeps that are left out of each: after half as many draws are those of
-            later ones, since u moves as a whole.
-        few: Sweeps where only means are asked for.
-        many: Sweeps of a belief: ends of a 95 % interval are then known to some .5 %.
-        absent: Prior probability that no doubtful effect is there, one half for want
-            of anything better; and that a channel's errors are white.
-        flat: Precision in units of the inverse square of a range, which leaves uniform
-            priors as they are and directions that nothing tells solvable.
-    """
-
-    chains: int = 64
-    burnt: int = 6
-    few: int = 6
-    many: int = 26
-    absent: float = 0.5
-    flat: float = 1e-4
-
-
-@dataclass(frozen=True, kw_only=True)
 class IdentifySettings:
     """Settings of what is spent, and of what is told apart.
 
@@ -46,7 +22,13 @@ class IdentifySettings:
         fit: Searches from these, at least, and how far they go.
         starts_each: Searches for each parameter.
         kept_each: Searches that go on, for each parameter.
-        sampler: Draws of the linear model.
+        num_draws: Draws of the posterior: ends of a 95 % interval are then known to
+            some 1 %.
+        num_errors: Draws of the errors that the linear model is summed over.
+        num_places: Draws of the coordinates without effects, and with all, by whose
+            residuals these are drawn: one would know the errors' size too well.
+        near: Nats behind the best set of effects up to which larger and smaller ones
+            are looked at.
         step: Step of finite differences, in deviations of the prior.
         tried: Deviations of the prior by which an effect that is absent is tried: many
             are flat at their null.
@@ -54,26 +36,24 @@ class IdentifySettings:
             own, below which it is an alias of them.
         likely: Probability from which an effect is fitted.
         linearized: Times at most that the model is linearized anew.
-        moved: A move that is worth it, in posterior deviations.
-        rounds: Times at most that channels are weighed by their residuals.
-        worth: Mean fall of the logarithm of these sizes that is worth another time.
+        moved: Posterior deviations that the simulator at the posterior's mean may move
+            it by, without which the model is linear enough: a tenth leaves a 95 %
+            interval .1 % short.
         smallest: Residual that a channel is taken to have at least, in its deviations.
         shares: Shares of the variance that are white, of errors of unknown size.
         least: Smallest share of a declared white error: below it sums of squares lose
             their digits.
-        num_compared: Draws at which the linear model is compared with the simulator:
-            half misses three of four posteriors of six parameters that are off by .6
-            standard deviations.
-        linear: Deviation of the log density ratio up to which it will do, nats.
-        num_weighed: Draws that are weighed where it will not.
-        fewest: Effective draws below which a belief whose draws are weighed is not to
-            be trusted.
+        num_compared: Draws at which the linear model is compared with the simulator.
+        linear: Deviation of the log density ratio up to which it will do, nats: models
+            that are linear have .1 at most, and half a nat misses one of eight
+            posteriors of six parameters whose means are off by .6 deviations.
+        most_simulated: Simulations of all trials that are spent where it will not.
+        fewest: Effective draws of these below which a belief rests on the linear model,
+            and is not to be trusted: few would make for a narrow interval.
         fewest_each: Effective draws as a multiple of d (d + 3) for d parameters, below
             which such a belief is not to be trusted, as for other beliefs.
         largest_shape: Shape of the tail of weights above which it is not either, as for
-            other beliefs: the linear model lacks places that the simulator explains.
-        fewest_kept: Effective draws that weights leave at least: few would make for a
-            narrow interval.
+            other beliefs.
         fewest_parts: Parts of the trials at least, for which trials are divided in
             time.
         level: Tail probability below which they disagree.
@@ -91,25 +71,25 @@ class IdentifySettings:
     fit: FitSettings = FitSettings(num_starts=3, num_kept=1, first=5)
     starts_each: float = 1.0
     kept_each: float = 0.3
-    sampler: SamplerSettings = SamplerSettings()
+    num_draws: int = 2_000
+    num_errors: int = 128
+    num_places: int = 8
+    near: float = 3.0
     step: float = 1e-4
     tried: float = 0.05
     alias: float = 0.02
     likely: float = 0.1
     linearized: int = 6
-    moved: float = 0.3
-    rounds: int = 10
-    worth: float = 0.01
+    moved: float = 0.1
     smallest: float = 1e-9
     shares: tuple[float, ...] = (1e-4, 1e-3, 0.01, 0.03, 0.1, 0.3, 0.6, 0.9)
     least: float = 1e-12
     num_compared: int = 16
-    linear: float = 0.5
-    num_weighed: int = 400
-    fewest: int = 50
+    linear: float = 0.25
+    most_simulated: int = 3_000
+    fewest: int = 100
     fewest_each: float = 2.5
     largest_shape: float = 0.7
-    fewest_kept: int = 100
     fewest_parts: int = 4
     level: float = 0.01
     wider: float = 3.0

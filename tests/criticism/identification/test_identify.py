@@ -4,77 +4,179 @@ import numpy as np
 import pytest
 import torch
 from sbi.utils import BoxUniform
-from scipy.stats import gamma
+from scipy.special import logsumexp
+from scipy.stats import gamma, norm
+from scipy.stats import t as student_t
 from torch.distributions import Gamma, Independent
 
 from sbi_active import GaussianNoise, SimulatorModel
 from sbi_active.criticism import Trials
 from sbi_active.criticism.identification import IdentifySettings, identify
-from sbi_active.criticism.identification.posterior import Sampler, Unknowns
+from sbi_active.criticism.identification.channels import ChannelErrors
+from sbi_active.criticism.identification.posterior import Posterior
+from sbi_active.criticism.linear.mixture import integrated
+from sbi_active.criticism.linear.model import LinearModel
 from sbi_active.criticism.linear.processes import Grams, Processes
+from sbi_active.criticism.results import ModelKey
+from sbi_active.inference.sampling.truncated import draws_between
 from sbi_active.mujoco import randomization
 from tests.effects import autocorrelated, on_outcomes
 
 WHITE = Processes(np.ones(1), np.zeros(1), np.full(1, np.inf), np.zeros(1, bool))
 
 
-def linear(num=200, strength=0.0, seed=0):
-    """Return white Gram matrices of a line and a doubtful parabola, of size one."""
+def linear(num=200, strength=0.0, seed=0, low=-np.inf, sd=(1e3, 1e3, 1.0)):
+    """Return a line and a doubtful parabola, in errors of size one."""
     rng = np.random.default_rng(seed)
     t = np.linspace(-1, 1, num)
     jacobian = np.stack([np.ones(num), t, t**2 - 1 / 3], 1)
-    r = rng.standard_normal(num) - strength * jacobian[:, 2]
-    rows = np.concatenate([r[:, None], jacobian], 1)
-    gram = (rows.T @ rows)[None, None]
-    return Grams(gram, np.zeros((1, 1)), np.array([num])), r, jacobian
+    return LinearModel(
+        key=ModelKey(),
+        u=np.zeros(3),
+        residual=rng.standard_normal(num) - strength * jacobian[:, 2],
+        jacobian=jacobian,
+        center=np.zeros(3),
+        sd=np.array(sd),
+        scaled=np.zeros(3, bool),
+        low=np.array([low, -np.inf, -np.inf]),
+        high=np.full(3, np.inf),
+        trial_of=np.full(3, -1),
+        num=num,
+        scale=np.ones(num),
+        offset=np.zeros(num),
+    )
 
 
-def unknowns(low=-np.inf, effect=(-1, -1, 0)):
-    low, high = np.array([low, -np.inf, -np.inf]), np.full(3, np.inf)
-    precision = np.where(np.array(effect) >= 0, 1.0, 0.0)
-    return Unknowns(low, high, np.zeros(3), precision, np.array(effect))
+def white(model, known: np.ndarray | None):
+    """Return white errors of a model's only channel."""
+    gram = (model.rows.T @ model.rows)[None, None]
+    grams = Grams(gram, np.zeros((1, 1)), np.array([model.num]))
+    return ChannelErrors(WHITE, grams, known, white=1.0)
 
 
-def draws(grams, own, size: float | None = 1.0, seed=0):
-    rng = np.random.default_rng(seed)
-    return Sampler(grams, WHITE, own, [size], rng).draws(60)
+def shift(x, phi, action, context):
+    """Return the first channel of x with an offset."""
+    return x + phi[:, None] * torch.tensor([1.0, 0.0], dtype=x.dtype)
+
+
+def posterior(model, effect=(-1, -1, -1), *, is_known=True):
+    errors, number = white(model, np.ones(1) if is_known else None), np.array(effect)
+    rng = np.random.default_rng(1)
+    drawn = errors.drawn(errors.places(model, number < 1, 8, rng), 4096, rng)
+    effects = [on_outcomes("parabola", shift, 1.0)] * (max(effect) + 1)
+    return Posterior(model, effects, number, *drawn, near=3.0)
+
+
+def draws(model, effect=(-1, -1, -1)):
+    return posterior(model, effect).draws(4000, np.random.default_rng(0))
 
 
 def test_without_doubt_it_is_least_squares():
-    grams, r, jacobian = linear()
-    found = draws(grams, unknowns(effect=(-1, -1, -1)))
+    model = linear(sd=(1e3, 1e3, 1e3))
+    found, jacobian = draws(model), model.jacobian
     cov = np.linalg.inv(jacobian.T @ jacobian)
-    assert found.u.mean(0) == pytest.approx(-cov @ jacobian.T @ r, abs=0.01)
+    best = -cov @ jacobian.T @ model.residual
+    assert found.u.mean(0) == pytest.approx(best, abs=0.01)
     assert found.u.std(0) == pytest.approx(np.sqrt(np.diag(cov)), rel=0.05)
 
 
 def test_presence_has_its_probability():
     """Against the evidence of both models, by the matrix of what is marginal."""
     for strength in (0.0, 0.25):
-        grams, r, jacobian = linear(strength=strength)
-        prior = np.array([1e6, 1e6, 1.0])  # nearly flat beside the doubtful one
-        log_z = []
+        model, log_z = linear(strength=strength), []
+        r = model.residual
         for k in (2, 3):
-            part = jacobian[:, :k]
-            cov = np.eye(len(r)) + part @ np.diag(prior[:k]) @ part.T
+            part = model.jacobian[:, :k]
+            cov = np.eye(len(r)) + part @ np.diag(model.sd[:k] ** 2) @ part.T
             log_z.append(-0.5 * (r @ np.linalg.solve(cov, r)))
             log_z[-1] -= 0.5 * np.linalg.slogdet(cov)[1]
         expected = 1 / (1 + np.exp(log_z[0] - log_z[1]))
-        found = draws(grams, unknowns())
-        assert found.present.mean() == pytest.approx(expected, abs=0.04)
+        found = draws(model, (-1, -1, 0))
+        assert found.present.mean() == pytest.approx(expected, abs=0.01)
         absent = ~found.present[:, 0]
         assert (found.u[absent, 2] == 0).all()
 
 
+def test_an_unknown_size_is_summed_out():
+    """Ends of an interval are Student's, of 12 numbers."""
+    model = linear(num=12, sd=(1e4, 1e4, 1e4))
+    found = posterior(model, is_known=False)
+    u = found.draws(20_000, np.random.default_rng(0)).u[:, 1]
+    freedom = model.num - 3
+    cov = np.linalg.inv(model.jacobian.T @ model.jacobian)
+    best = -cov @ model.jacobian.T @ model.residual
+    square = ((model.residual + model.jacobian @ best) ** 2).sum()
+    sd = np.sqrt(cov[1, 1] * square / freedom)
+    ends = best[1] + sd * student_t(freedom).ppf([0.025, 0.975])
+    assert np.quantile(u, [0.025, 0.975]) == pytest.approx(ends, abs=0.1 * sd)
+
+
+@pytest.mark.parametrize("is_known", [True, False])
+def test_the_sum_over_draws_of_errors_is_that_over_all_of_them(is_known):
+    """Of two channels with three hypotheses each, by quadrature over their sizes."""
+    model, step = linear(num=40, sd=(3.0, 3.0, 1.0)), 0.02
+    apart = np.abs(np.subtract.outer(np.arange(20), np.arange(20)))
+    kernels = [np.eye(20), 0.7**apart, 0.3 * np.eye(20) + 0.7 * 0.9**apart]
+    rows = model.rows.reshape(2, 20, 4)
+    gram = np.stack([[r.T @ np.linalg.solve(k, r) for r in rows] for k in kernels])
+    log_det = np.stack([np.repeat(np.linalg.slogdet(k)[1], 2) for k in kernels])
+    white, ones = np.array([1.0, 0.0, 0.3]), np.ones(3)
+    processes = Processes(np.maximum(white, 0.1), 1 - white, ones, ones > 1)
+    known = np.array([0.6, 0.4]) if is_known else None
+    errors = ChannelErrors(processes, Grams(gram, log_det, np.full(2, 20)), known)
+    rng, every = np.random.default_rng(0), np.ones(3, bool)
+    drawn = errors.drawn(errors.places(model, every, 8, rng), 4096, rng)
+    found = Posterior(model, [], np.full(3, -1), *drawn, near=3.0)
+    # All of them: the variance of each hypothesis, or a fine grid over its logarithm.
+    sizes = np.zeros(1) if is_known else np.arange(-2.5, 2.5, step)
+    log_z = []
+    for h in np.ndindex(3, 3):
+        base = np.square(known) / processes.white[[*h]] if is_known else np.ones(2)
+        v = base * np.exp(np.stack(np.meshgrid(sizes, sizes), -1).reshape(-1, 2))
+        own = (gram[h, [0, 1]] / v[..., None, None]).sum(1)
+        prior = np.log(np.where(np.array(h) > 0, 0.25, 0.5)) - 0.5 * log_det[h, [0, 1]]
+        log_p = (prior - 10 * np.log(v)).sum(1) + integrated(own, model, (1.0,))[0][
+            :, 0
+        ]
+        log_z.append(logsumexp(log_p) + (0 if is_known else 2 * np.log(step)))
+    log_p = found.log_p[0] - np.log(0.5)  # of no effect
+    weight = np.exp(log_p - log_p.max())
+    error = weight.std() / weight.mean() / 64
+    assert logsumexp(log_p) - np.log(4096) == pytest.approx(
+        logsumexp(log_z), abs=4 * error
+    )
+    assert error < 0.05
+
+
 def test_bounds_hold():
-    grams, r, jacobian = linear()
-    best = -(np.linalg.inv(jacobian.T @ jacobian) @ jacobian.T @ r)[0]
-    sd = 1 / np.sqrt(len(r))
+    model = linear()
+    best = -(np.linalg.pinv(model.jacobian) @ model.residual)[0]
+    sd = 1 / np.sqrt(model.num)
     low = best + sd  # an edge one deviation above the best
-    found = draws(grams, unknowns(low=low, effect=(-1, -1, -1)))
+    found = draws(linear(low=low))
     assert found.u[:, 0].min() >= low
     # Of a normal variable above one deviation.
     assert found.u[:, 0].mean() == pytest.approx(best + 1.5251 * sd, abs=0.1 * sd)
+
+
+def test_draws_between_bounds_that_are_correlated_have_their_moments():
+    rng = np.random.default_rng(0)
+    cov = np.array([[1.0, 0.8, 0.3], [0.8, 1.0, 0.5], [0.3, 0.5, 1.0]])
+    low, high = np.array([0.5, -1.0, -np.inf]), np.array([np.inf, 0.7, np.inf])
+    every = rng.multivariate_normal(np.zeros(3), cov, 400_000)
+    inside = ((every > low) & (every < high)).all(1)
+    shape = 40_000, 3
+    given = np.zeros(shape), np.broadcast_to(cov, (*shape, 3))
+    u, log_weight = draws_between(*given, low, high, rng)
+    weight = np.exp(log_weight - log_weight.max())
+    weight /= weight.sum()
+    assert ((u >= low) & (u <= high)).all()
+    assert weight @ u == pytest.approx(every[inside].mean(0), abs=0.02)
+    assert np.cov(u.T, aweights=weight) == pytest.approx(
+        np.cov(every[inside].T), abs=0.03
+    )
+    alone = norm.sf(0.5) * (norm.cdf(0.7) - norm.cdf(-1.0))
+    assert np.exp(log_weight).mean() * alone == pytest.approx(inside.mean(), rel=0.03)
 
 
 # A belief from trajectories of an oscillator, which is solved in closed form
@@ -176,10 +278,6 @@ def test_errors_far_beyond_the_declared_one_have_their_size(times):
 
 def test_what_may_be_there_is_found_or_not():
     """A shift of the position beside it: found, and theta as narrow as before."""
-
-    def shift(x, phi, action, context):
-        return x + phi[:, None] * torch.tensor([1.0, 0.0], dtype=x.dtype)
-
     bias = on_outcomes("bias", shift, 0.5)
     extra = torch.tensor([0.1, 0.0])
     for there in (False, True):
