@@ -11,7 +11,7 @@ from torch import Tensor
 
 from sbi_active.arrays import Array
 from sbi_active.design.estimators.base import CandidateSimulations
-from sbi_active.inference.sampling.mixtures import StudentMixture, lower_factors
+from sbi_active.inference.sampling.mixtures import StudentMixture, fitted_normals
 from sbi_active.inference.sampling.weights import silverman
 
 NUM_FOLDS = 4  # a choice: fits of three quarters of the rows, four times
@@ -118,72 +118,48 @@ class Reduction:
         return (self.standard(x) @ self.direction).clamp(-self.limit, self.limit)
 
 
+def mixture(rows: Tensor, most: int) -> StudentMixture:
+    """Fit a mixture of at most so many normals to rows (n, d)."""
+    rng = np.random.default_rng(0)
+    return fitted_normals(rows.numpy(), most, rng, num_iterations=40)
+
+
 LogDensities = Callable[[Tensor], Tensor]
 
 
 def class_members(
-    x: Tensor,
-    label: Tensor,
-    enough: Tensor,
-    *,
-    kernels: bool = True,
-    bandwidths: tuple[float, ...] = (0.5, 1.0),
-    shrinkage: float = 5.0,
+    x: Tensor, label: Tensor, enough: Tensor, *, sizes: tuple[int, ...] = (1, 6)
 ) -> list[LogDensities]:
-    """Fit relative densities of each class, in several ways.
-
-    The order is: none; normals with a covariance each, shrunk to the common one; kernel
-    densities with these covariances.
+    """Fit relative densities of each class: none, and mixtures of normals.
 
     Args:
         x: Outcomes, shape (n, q), q may be 0.
         label: Class, shape (n,).
         enough: Whether a class has rows enough for a density, shape (k,), bool; where
             one has not, only the first is fitted.
-        kernels: Whether to fit kernel densities, the dearest ones.
-        bandwidths: Bandwidths, in those of Silverman's rule.
-        shrinkage: Rows' worth of the common covariance in that of a class.
+        sizes: Numbers of normals of a class.
 
     Returns:
         Functions of outcomes (m, q) that give log densities up to what is common to
         the classes, shape (m, k).
     """
-    num_classes = len(enough)
+    classes = range(len(enough))
     members: list[LogDensities] = [
-        lambda new: torch.zeros(len(new), num_classes, dtype=torch.float64)
+        lambda new: torch.zeros(len(new), len(classes), dtype=torch.float64)
     ]
     if x.shape[1] == 0 or not bool(enough.all()):
         return members
-    reduction = Reduction.fit(x, torch.nn.functional.one_hot(label).double())
-
-    def reduce(new: Tensor) -> Array:
-        return reduction(new).numpy()
-
-    z = reduce(x)
-    rows = [z[(label == k).numpy()] for k in range(num_classes)]
-    scatter = np.stack([(r - r.mean(0)).T @ (r - r.mean(0)) for r in rows])
-    tiny = np.diag(1e-8 * np.maximum(z.var(0), 1e-30))
-    common = scatter.sum(0) / (len(z) - num_classes) + tiny
-    count = np.array([len(row) for row in rows])[:, None, None]
-    shrunk = (scatter + shrinkage * common) / (count - 1 + shrinkage) + tiny
-    pairs = [*zip(rows, lower_factors(shrunk), strict=True)]
-    fits = [
-        [StudentMixture(r.mean(0)[None], f[None], freedom=np.inf) for r, f in pairs]
-    ]
-    for width in bandwidths if kernels else ():
-        widths = [width * silverman(*r.shape) for r in rows]
-        each = zip(pairs, widths, strict=True)
-        fits.append(
-            [_kernels(r, h * f[None].repeat(len(r), 0), f) for (r, f), h in each]
-        )
+    reduce = Reduction.fit(x, torch.nn.functional.one_hot(label).double())
+    rows = [reduce(x[label == k]) for k in classes]
+    fits = [[mixture(own, size) for own in rows] for size in sizes]
     return members + [_by_class(fit, reduce) for fit in fits]
 
 
 def _by_class(
-    mixtures: Sequence[StudentMixture], reduce: Callable[[Tensor], Array]
+    mixtures: Sequence[StudentMixture], reduce: Callable[[Tensor], Tensor]
 ) -> LogDensities:
     def log_density(x: Tensor) -> Tensor:
-        z = reduce(x)
+        z = reduce(x).numpy()
         return torch.from_numpy(np.stack([m.log_prob(z) for m in mixtures], 1))
 
     return log_density
@@ -236,7 +212,7 @@ def noise_members(
     known = mean.numpy(), sd.square().numpy()
     classes = [(label == k).numpy() for k in range(len(enough))]
     fits = [_noise_kernels(*(part[own] for part in known)) for own in classes]
-    return [_by_class(fits, lambda new: new.numpy())]
+    return [_by_class(fits, lambda new: new)]
 
 
 def _noise_kernels(

@@ -165,7 +165,7 @@ class ModelIndexGain(InformationGainEstimator):
         q(k | x, \xi) \propto p_k\, P_k(v)\, f_k(x | v)^{\beta}
 
     with v the numbers of x that are present, P_k(v) their share among the model's
-    draws, and f_k a density of them: Gaussian or by kernels, of a few discriminating
+    draws, and f_k a density of them: a mixture of normals, of a few discriminating
     numbers where x is long; :math:`\beta \le 1` tempers it. Where the
     rivals know their noise and x is short, kernels at the outcomes without noise are as
     narrow as the noise. All are fitted to three quarters of the draws and score the
@@ -245,7 +245,7 @@ class ModelIndexGain(InformationGainEstimator):
             if len(noise) == 2:
                 center, width = (part[train] for part in noise)
                 narrow = noise_members(center, width, own[train], enough)
-            wide = class_members(x[train], own[train], enough, kernels=not narrow)
+            wide = class_members(x[train], own[train], enough)
             scores = []
             for member in [*wide, *narrow]:
                 log_f = member(x[test])
