@@ -1,4 +1,4 @@
-"""Variational lower bounds: a learned posterior, or one fitted to each candidate."""
+"""A variational lower bound, by a posterior that is fitted to each candidate."""
 
 from __future__ import annotations
 
@@ -25,46 +25,6 @@ from sbi_active.design.estimators.densities import (
 )
 from sbi_active.design.estimators.entropy import nearest_neighbor_entropy
 from sbi_active.seeding import forked_generators
-
-
-class PosteriorGain(InformationGainEstimator):
-    r"""Barber-Agakov bound, the utility of ASBI.
-
-    .. math::
-        U(\xi) = \frac{1}{M} \sum_{i=1}^M
-        \log q(\theta_i | x_i, \xi) - \log p(\theta_i)
-        \qquad \text{(Eqs. 12-13)}
-
-    with :math:`\theta_i \sim p`, :math:`x_i \sim p(x | \theta_i, \xi)`. For any q,
-    :math:`E[U(\xi)] = I(\theta; x | \xi) - E[\mathrm{KL}(p(\theta | x, \xi) \| q)]`,
-    so on simulations that q was not trained on it is a lower bound. Its slack differs
-    by action: ranking by it is not ranking by information where q is blunter for one
-    action than for another. Outcomes at the same parameters are averaged, as they are
-    not independent.
-
-    The model has ``log_posterior(theta, x, action)``, the log density of every row,
-    shape (n,).
-
-    References:
-        Kim & Matsubara, Applied Intelligence 2025; Barber & Agakov, NeurIPS 2003.
-    """
-
-    bound: Bound = "lower"
-    batch_size: int = 50_000  # rows in one pass of the network
-
-    def _contributions(
-        self, model: Any, simulations: CandidateSimulations, belief: Distribution
-    ) -> Tensor:
-        density = getattr(belief, "smooth_log_prob", belief.log_prob)
-        log_p = density(simulations.theta)
-        theta, action = simulations.rows()
-        gains = []
-        for x in simulations.outcomes():
-            rows = theta, x.flatten(0, 1), action
-            batches = zip(*(part.split(self.batch_size) for part in rows), strict=True)
-            log_q = torch.cat([model.log_posterior(*batch) for batch in batches])
-            gains.append(log_q.reshape(x.shape[:2]) - log_p)
-        return torch.stack(gains).mean(0)
 
 
 class ParameterGain(InformationGainEstimator):
