@@ -165,16 +165,6 @@ def _by_class(
     return log_density
 
 
-def _kernels(
-    knots: Array, factors: Array, wide: Array, *, tail: float = 0.1
-) -> StudentMixture:
-    """Return normal kernels, and a normal of all draws for what lies between them."""
-    n = len(knots)
-    weights = np.append(np.full(n, (1 - tail) / n), tail)
-    means = np.concatenate([knots, knots.mean(0)[None]])
-    return StudentMixture(means, np.concatenate([factors, wide[None]]), weights, np.inf)
-
-
 #: Numbers of an outcome up to which each kernel has a covariance of its own.
 MOST_NUMBERS = 12
 
@@ -216,23 +206,29 @@ def noise_members(
 
 
 def _noise_kernels(
-    mean: Array, variance: Array, *, factor: float = 0.25
+    mean: Array, variance: Array, *, factor: float = 0.25, tail: float = 0.1
 ) -> StudentMixture:
     """Return the density of one class, by means and variances (n, q).
 
-    The factor is that of Silverman's rule; with one four times as large, the
-    information of six pairs of models was the same to .007 nat.
+    Args:
+        mean: Outcomes without noise.
+        variance: Variances of the noise.
+        factor: Factor of Silverman's rule; with one four times as large, the
+            information of six pairs of models was the same to .007 nat.
+        tail: Weight of a normal of all draws, for what lies between the kernels.
     """
-    apart = mean - mean.mean(0)
-    covariance = apart.T @ apart / (len(mean) - 1)
+    center, n = mean.mean(0), len(mean)
+    apart = mean - center
+    covariance = apart.T @ apart / (n - 1)
     # directions in which the kernels would lie apart without smoothing
     unit = variance.mean(0) ** -0.5
     spread = np.linalg.eigvalsh(unit[:, None] * covariance * unit)
     num_distinct = len({row.tobytes() for row in mean})
     d = max(1, int((spread > 1).sum()))
     h = min(factor * silverman(max(2, num_distinct), d), 1.0)
-    knots = mean.mean(0) + np.sqrt(1 - h**2) * apart
-    one = np.eye(mean.shape[1])
-    factors = np.linalg.cholesky(variance[:, None] * one + h**2 * covariance)
-    wide = np.linalg.cholesky(variance.mean(0) * one + covariance)
-    return _kernels(knots, factors, wide)
+    knots = np.append(np.sqrt(1 - h**2) * apart, 0 * apart[:1], 0)
+    own = variance[:, None] * np.eye(len(center)) + h**2 * covariance
+    wide = variance.mean(0) * np.eye(len(center)) + covariance
+    factors = np.linalg.cholesky(np.append(own, wide[None], 0))
+    weights = np.append(np.full(n, (1 - tail) / n), tail)
+    return StudentMixture(center + knots, factors, weights, np.inf)
