@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -67,55 +66,42 @@ def by_pattern(
             yield a, members, torch.empty(0).long(), x[members, :0]
 
 
-@dataclass(frozen=True)
-class Reduction:
-    r"""Standardized outcomes, or the directions of them that predict the target.
+Reduction = Callable[[Tensor], Tensor]
+
+
+def reduction(
+    x: Tensor, target: Tensor, *, most: int = 6, ridge: float = 0.01, limit: float = 8.0
+) -> Reduction:
+    """Return a function that standardizes outcomes, and makes long ones short.
 
     Long outcomes are projected on the slopes of ridge regressions of the target's
-    numbers on x, and on the leading principal components, six in all.
+    numbers on x, and on the leading principal components.
 
-    Attributes:
-        center: Center of the outcomes, shape (q,).
-        scale: Scale of the outcomes, shape (q,).
-        direction: Directions, shape (q, r).
+    Args:
+        x: Outcomes, shape (n, q).
+        target: Numbers to predict, shape (n, t).
+        most: Numbers that are left of an outcome.
+        ridge: Share of the total variance that a direction is penalized by.
         limit: Standard deviations beyond which a number is cut off.
     """
+    n, q = x.shape
+    center, scale = x.mean(0), x.std(0)
+    scale = torch.where(scale > 1e-30, scale, 1.0)
 
-    center: Tensor
-    scale: Tensor
-    direction: Tensor
-    limit: float = 8.0
+    def standard(new: Tensor) -> Tensor:
+        return ((new - center) / scale).clamp(-limit, limit)
 
-    @staticmethod
-    def fit(
-        x: Tensor, target: Tensor, *, most: int = 6, ridge: float = 0.01
-    ) -> Reduction:
-        """Fit to outcomes (n, q) and numbers to predict (n, t).
-
-        Outcomes of at most ``most`` numbers need no reduction. The ridge is the share
-        of the total variance that a direction is penalized by.
-        """
-        n, q = x.shape
-        center, scale = x.mean(0), x.std(0)
-        scale = torch.where(scale > 1e-30, scale, 1.0)
-        z = (x - center) / scale
-        if q <= most:
-            return Reduction(center, scale, torch.eye(q, dtype=x.dtype))
-        moment = z.T @ z / n + ridge * torch.eye(q)
-        slope = torch.linalg.solve(moment, z.T @ (target - target.mean(0)) / n)
-        left, value, _ = torch.linalg.svd(slope, full_matrices=False)
-        slope = left[:, value > 1e-9 * value.amax()][:, : most - 2]
-        leading = torch.linalg.eigh(moment).eigenvectors.flip(1)[:, :most]
-        direction = torch.linalg.qr(torch.cat([slope, leading], 1)).Q[:, :most]
-        return Reduction(center, scale, direction / (z @ direction).std(0))
-
-    def standard(self, x: Tensor) -> Tensor:
-        """Return all numbers standardized, shape (n, q)."""
-        return ((x - self.center) / self.scale).clamp(-self.limit, self.limit)
-
-    def __call__(self, x: Tensor) -> Tensor:
-        """Return the reduced outcomes, shape (n, r)."""
-        return (self.standard(x) @ self.direction).clamp(-self.limit, self.limit)
+    if q <= most:
+        return standard
+    z = (x - center) / scale
+    moment = z.T @ z / n + ridge * torch.eye(q)
+    slope = torch.linalg.solve(moment, z.T @ (target - target.mean(0)) / n)
+    left, value, _ = torch.linalg.svd(slope, full_matrices=False)
+    slope = left[:, value > 1e-9 * value.amax()][:, : most - 2]
+    leading = torch.linalg.eigh(moment).eigenvectors.flip(1)[:, :most]
+    direction = torch.linalg.qr(torch.cat([slope, leading], 1)).Q[:, :most]
+    direction = direction / (z @ direction).std(0)
+    return lambda new: (standard(new) @ direction).clamp(-limit, limit)
 
 
 def mixture(rows: Tensor, most: int) -> StudentMixture:
@@ -149,15 +135,13 @@ def class_members(
     ]
     if x.shape[1] == 0 or not bool(enough.all()):
         return members
-    reduce = Reduction.fit(x, torch.nn.functional.one_hot(label).double())
+    reduce = reduction(x, torch.nn.functional.one_hot(label).double())
     rows = [reduce(x[label == k]) for k in classes]
     fits = [[mixture(own, size) for own in rows] for size in sizes]
     return members + [_by_class(fit, reduce) for fit in fits]
 
 
-def _by_class(
-    mixtures: Sequence[StudentMixture], reduce: Callable[[Tensor], Tensor]
-) -> LogDensities:
+def _by_class(mixtures: Sequence[StudentMixture], reduce: Reduction) -> LogDensities:
     def log_density(x: Tensor) -> Tensor:
         z = reduce(x).numpy()
         return torch.from_numpy(np.stack([m.log_prob(z) for m in mixtures], 1))

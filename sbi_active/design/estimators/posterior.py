@@ -18,10 +18,10 @@ from sbi_active.design.estimators.base import (
     InformationGainEstimator,
 )
 from sbi_active.design.estimators.densities import (
-    Reduction,
     by_pattern,
     cross_fit,
     mixture,
+    reduction,
 )
 from sbi_active.design.estimators.entropy import nearest_neighbor_entropy
 from sbi_active.seeding import forked_generators
@@ -104,7 +104,7 @@ class ParameterGain(InformationGainEstimator):
 def _score(u: Tensor, x: Tensor) -> Tensor:
     def score(train: Tensor, test: Tensor) -> Tensor:
         known = u[train]
-        reduce = Reduction.fit(x[train], torch.cat([known, known.square()], 1))
+        reduce = reduction(x[train], torch.cat([known, known.square()], 1))
         standard = log_normal(u[test])
         members = [conditional(known, reduce(x[train]), k) for k in NUM_NORMALS]
         log_q = [member(u[test], reduce(x[test])) for member in members]
