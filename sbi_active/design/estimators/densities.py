@@ -85,6 +85,8 @@ def reduction(
         limit: Standard deviations beyond which a number is cut off.
     """
     n, q = x.shape
+    if q == 0:
+        return lambda new: new
     center, scale = x.mean(0), x.std(0)
     scale = torch.where(scale > 1e-30, scale, 1.0)
 
