@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 from torch.distributions import Distribution
 
-from sbi_active.design.estimators.emulator import Emulated, MeanEmulator
+from sbi_active.design.estimators.emulator import Emulated, MeanEmulator, whitening
 from sbi_active.inference.sampling.mixtures import log_student
 from sbi_active.seeding import forked_generators
 from sbi_active.simulation import GaussianNoise, NoiseModel
@@ -182,8 +182,8 @@ class Evidence:
         The belief enters as the Gaussian of its draws' moments. A step is kept where
         it does not raise the misfit.
         """
-        z, center = self.knots[i], self.knots.mean(0)
-        prior = precision_of(self.knots)
+        z, (center, white) = self.knots[i], whitening(self.knots)
+        prior = white @ white.mT
 
         def misfit(z: Tensor, outcome: Tensor) -> Tensor:
             residual = x.flatten(1) / self.scale - outcome
@@ -199,13 +199,6 @@ class Evidence:
         after = self._outcomes(moved[:, None], slope, i)[:, 0]
         better = misfit(moved, after) < misfit(z, own)
         return torch.where(better[:, None], moved, z), precision
-
-
-def precision_of(theta: Tensor) -> Tensor:
-    """Return the inverse covariance of parameters (n, d) of about unit size, (d, d)."""
-    d = theta.shape[1]
-    spread = torch.cov(theta.T).reshape(d, d) + 1e-9 * torch.eye(d)
-    return torch.linalg.inv(spread)
 
 
 def _pairwise(noise: NoiseModel, x: Tensor, mean: Tensor) -> Tensor:
