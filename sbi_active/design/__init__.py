@@ -8,12 +8,15 @@ tells, in nats. It contains no inference of parameters.
 from sbi_active.design.design import Design
 from sbi_active.design.designer import InformationGainDesigner
 from sbi_active.design.estimators.base import InformationGainEstimator
-from sbi_active.design.estimators.contrast import LikelihoodGain, RatioGain
+from sbi_active.design.estimators.contrast import (
+    LikelihoodGain,
+    PosteriorGain,
+    RatioGain,
+)
 from sbi_active.design.estimators.entropy import EntropyGain
 from sbi_active.design.estimators.linear import LinearGain
 from sbi_active.design.estimators.model_index import ModelIndexGain
 from sbi_active.design.estimators.nested import NestedGain
-from sbi_active.design.estimators.posterior import PosteriorGain
 from sbi_active.design.random_designer import RandomDesigner
 from sbi_active.design.search import GradientSearch, Search
 

@@ -82,8 +82,8 @@ class Coordinates:
         same = (point[:, c:] == other[c:]).all(1)
         return apart.masked_fill(~same, torch.inf)
 
-    def spread(self, num: int, seed: int) -> Tensor:
-        """Return points that fill the space, shape (num, dim): scrambled Sobol."""
+    def drawn(self, num: int, seed: int) -> Tensor:
+        """Return points all over the space, shape (num, dim): scrambled Sobol."""
         engine = torch.quasirandom.SobolEngine(
             self.dim, scramble=True, seed=seed % 2**31
         )
@@ -91,3 +91,17 @@ class Coordinates:
         sizes = torch.tensor(self.sizes)
         point[:, self.num_continuous :].mul_(sizes).floor_()
         return point
+
+    def filling(self, point: Tensor, num: int) -> Tensor:
+        """Return the num points of (n, dim) that leave the smallest holes.
+
+        Each is the farthest from those before it. The edge is half as far as it would
+        be from a point: points stand off it by half of what lies between them.
+        """
+        inside = point[:, : self.num_continuous]
+        room = 2 * torch.minimum(inside, 1 - inside).amin(1)
+        chosen = []
+        for _ in range(min(num, len(point))):
+            chosen.append(int(room.argmax()))
+            room = torch.minimum(room, self.distance(point, point[chosen[-1]]))
+        return point[chosen]

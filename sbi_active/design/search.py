@@ -127,23 +127,26 @@ class GradientSearch(Search):
 
     so that a regression :math:`\mu(\xi) \pm s(\xi)` of them (:class:`.GaussianProcess`)
     has the gradient that U is lacking; as has one of what other estimators give, on
-    common random numbers. Where simulations are given and the estimator scores rows one
-    by one, such as the paper's, they are all that is needed. Otherwise half of a
-    design's simulations are the search's, and the others compare its finalists. Half of
-    its evaluations fill the space, at common parameters and with common noise; the
-    others follow in rounds where :math:`\mu(\xi) + 2 s(\xi)` is largest. The actions
-    of a round are chosen from the ends one after the other, each as if those before had
-    been evaluated. A point that leaves what is permitted goes back to its edge.
+    common random numbers. Half of a design's simulations are the search's, and the
+    others compare its finalists. Half of its evaluations fill the space, each the
+    farthest from those before, at common parameters and with common noise; the others
+    follow in rounds where :math:`\mu(\xi) + 4 s(\xi)` is largest. The actions of a
+    round are chosen from the ends one after the other, each as if those before had been
+    evaluated. A point that leaves what is permitted goes back to its edge.
 
     Attributes:
         num_rounds: Rounds after the first.
         num_finalists: Actions to compare in the end.
         num_starts: Number of starts of an ascent.
         optimism: Standard deviations of the regression that a proposal may hope for.
+            With half as many the later rounds stay where the best is known, and one of
+            forty narrow optima was missed.
         apart: Least distance of actions chosen together, in the unit cube.
         penalty: Deviations of the utility that an action loses for a measurement that
             is too improbable, a unit of probability.
         fewest: Number of evaluations that a search needs.
+        choice: Draws for each point that fills the space. A quarter leaves larger
+            holes.
         each: Candidates' worth of simulations for each degree of freedom (an entry of a
             box, a category after the first), and for none.
 
@@ -155,11 +158,12 @@ class GradientSearch(Search):
     num_rounds: ClassVar[int] = 6
     num_finalists: ClassVar[int] = 5
     num_starts: ClassVar[int] = 64
-    optimism: ClassVar[float] = 2.0
+    optimism: ClassVar[float] = 4.0
     apart: ClassVar[float] = 0.02
     penalty: ClassVar[float] = 10.0
     fewest: ClassVar[int] = 8
     each: ClassVar[int] = 4
+    choice: ClassVar[int] = 32
 
     @override
     def size(self, actions: ActionSpace) -> int:
@@ -189,25 +193,16 @@ class GradientSearch(Search):
             if num == 0:
                 continue
             left -= num
-            point, score, utility = self._ascended(
-                objective, found.known(), f"round {r}", self.optimism
-            )
-            best = self._chosen(space, point, score, utility.covariance(point), num)
-            if len(best) == 0:
-                break
-            found = found.join(objective.evaluate(space.actions(point[best])))
-        point, score, _ = self._ascended(objective, found.known(), "finalists", 0.0)
-        none = torch.zeros(len(point), len(point)).double()
-        best = self._chosen(space, point, score, none, self.num_finalists)
-        return space.actions(point[best])
+            known, key = found.known(), f"round {r}"
+            best = self._best(objective, known, key, num, self.optimism)
+            found = found.join(objective.evaluate(space.actions(best)))
+        known, num = found.known(), self.num_finalists
+        return space.actions(self._best(objective, known, "finalists", num, 0.0))
 
     def _spread(self, objective: Objective, num: int, key: str) -> Tensor:
         """Return permitted points that fill the space, shape (num, dim)."""
-        seed = derive_seed(objective.seed, key)
-        point = objective.space.spread(num, seed)
-        if bool(objective.allows(point).all()):
-            return point
-        drawn = objective.space.spread(32 * num, seed)
+        space = objective.space
+        drawn = space.drawn(self.choice * num, derive_seed(objective.seed, key))
         point = drawn[objective.allows(drawn)]
         if len(point) < min(num, self.fewest):
             raise ValueError(
@@ -215,69 +210,60 @@ class GradientSearch(Search):
                 f"got {len(point)} of {len(drawn)} actions; narrow the space to about "
                 "what is permitted"
             )
-        return point[:num]
+        return space.filling(point, num)
 
-    def _ascended(
-        self, objective: Objective, found: Evaluations, key: str, optimism: float
-    ) -> tuple[Tensor, Tensor, GaussianProcess]:
-        """Return permitted points (s, dim), where ascents started and ended.
+    def _best(
+        self,
+        objective: Objective,
+        found: Evaluations,
+        key: str,
+        num: int,
+        optimism: float,
+    ) -> Tensor:
+        """Return permitted points (num, dim) to hope most for, none close to others.
 
-        Beside them are their scores (s,), and the regression of the utility.
+        They are where ascents started or ended. Each is chosen as if those before had
+        been evaluated: what it may hope for falls with the variance that they leave
+        (GP-BUCB). An evaluation beside another, on common random numbers, tells nothing
+        new.
         """
-        space, least = objective.space, objective.min_probability_valid
-        lacking = (least - found.probability_valid).clamp_min(0.0)
-        value = found.utility - self.penalty * found.utility.std() * lacking
-        known = space.points(found.action)
-        utility = GaussianProcess.fit(
-            known,
-            value[:, None],
-            noise=found.standard_error,
-            num_categories=len(space.sizes),
-            settings=IN_CUBE,
-        )
+        space, utility = objective.space, self._regression(objective, found)
 
         def score(z: Tensor) -> Tensor:
             mean, variance = utility(z)
             return (mean + optimism * variance.sqrt())[:, 0]
 
-        known = known[objective.permitted(found.action)]
+        known = space.points(found.action)[objective.permitted(found.action)]
         start = torch.cat([self._spread(objective, self.num_starts, key), known])
         # An ascent may end lower than it started.
         point = torch.cat([ascended(score, start, objective), start])
         with torch.no_grad():
-            return point, score(point), utility
-
-    def _chosen(
-        self,
-        space: Coordinates,
-        point: Tensor,
-        score: Tensor,
-        covariance: Tensor,
-        num: int,
-    ) -> Tensor:
-        """Return indices of the best points, one after the other, none close to others.
-
-        Each is chosen as if those before had been evaluated: what it may hope for falls
-        with the variance that they leave (GP-BUCB). An evaluation beside another, on
-        common random numbers, tells nothing new. Of points (m, dim) with scores (m,)
-        that hold what may be hoped for, and the regression's covariance (m, m), zero
-        where nothing is hoped for.
-        """
-
-        def hope() -> Tensor:
-            return self.optimism * covariance.diagonal().clamp_min(0.0).sqrt()
-
+            mean = utility(point)[0][:, 0]
+        covariance = utility.covariance(point)
         least = 1e-6 * float(covariance.diagonal().amax()) or 1.0
-        mean = score - hope()
         taken = torch.zeros(len(point)).bool()
         chosen: list[int] = []
         while len(chosen) < num and not bool(taken.all()):
-            i = int((mean + hope()).masked_fill(taken, -torch.inf).argmax())
+            hope = mean + optimism * covariance.diagonal().clamp_min(0.0).sqrt()
+            i = int(hope.masked_fill(taken, -torch.inf).argmax())
             chosen.append(i)
             column = covariance[:, i]
             covariance = covariance - column.outer(column) / (column[i] + least)
             taken |= space.distance(point, point[i]) < self.apart
-        return torch.tensor(chosen).long()
+        return point[chosen]
+
+    def _regression(self, objective: Objective, found: Evaluations) -> GaussianProcess:
+        """Return the regression of the utility, less what is measured too seldom."""
+        space, least = objective.space, objective.min_probability_valid
+        lacking = (least - found.probability_valid).clamp_min(0.0)
+        value = found.utility - self.penalty * found.utility.std() * lacking
+        return GaussianProcess.fit(
+            space.points(found.action),
+            value[:, None],
+            noise=found.standard_error,
+            num_categories=len(space.sizes),
+            settings=IN_CUBE,
+        )
 
 
 def ascended(

@@ -28,8 +28,10 @@ MODEL = SimulatorModel(
 )
 
 
-def select(target, *, actions=SIDES, model=MODEL, belief=PRIOR, **options):
-    designer = InformationGainDesigner(actions, num_samples=400, **options)
+def select(
+    target, *, actions=SIDES, model=MODEL, belief=PRIOR, num_samples=400, **options
+):
+    designer = InformationGainDesigner(actions, num_samples=num_samples, **options)
     return designer.select(None, model, belief=belief, target=target, seed=0)
 
 
@@ -85,6 +87,7 @@ def test_a_failure_or_none():
         actions=DiscreteActions([0.1, 100.0]),
         model=model,
         belief=ONE,
+        num_samples=1_500,
     )
     weak, strong = design.expected_information_gain.tolist()
     assert abs(weak) < 0.05

@@ -14,11 +14,16 @@ from sbi_active.design.estimators.base import (
     InformationGainEstimator,
     standard_error,
 )
-from sbi_active.design.estimators.contrast import InfoNCEGain, LikelihoodGain, RatioGain
+from sbi_active.design.estimators.contrast import (
+    InfoNCEGain,
+    LikelihoodGain,
+    PosteriorGain,
+    RatioGain,
+)
 from sbi_active.design.estimators.entropy import EntropyGain, random_presence
 from sbi_active.design.estimators.linear import LinearGain
 from sbi_active.design.estimators.nested import NestedGain
-from sbi_active.design.estimators.posterior import ParameterGain, PosteriorGain
+from sbi_active.design.estimators.posterior import ParameterGain
 from sbi_active.messages import warn
 
 #: Name of an estimator: its class.

@@ -87,14 +87,6 @@ class CandidateSimulations:
         """Return x and, where there are any, replicates."""
         return [self.x] if self.replicate is None else [self.x, self.replicate]
 
-    def rows(self) -> tuple[Tensor, Tensor]:
-        """Return theta and action of every outcome in turn, a * n rows each."""
-        num_actions, num_samples = self.x.shape[:2]
-        return (
-            self.theta.repeat(num_actions, 1),
-            self.action.repeat_interleave(num_samples, 0),
-        )
-
     def candidates(self, index: Tensor) -> CandidateSimulations:
         """Return some candidates, index (k,)."""
         parts = {name: part[index] for name, part in self._parts().items()}

@@ -1,7 +1,9 @@
-r"""Information gain by a learned likelihood or ratio, against other parameters.
+r"""Information gain by a learned posterior, likelihood or ratio.
 
-Every estimate here is :math:`E[f(x_i, \theta_i) - \log \hat p(x_i)]` with a function f
-of the model; the classes differ in the parameters whose mean is :math:`\hat p`.
+Every estimate here is the mean of :math:`f(x_i, \theta_i)`, a function of the model,
+less the log density of what it is compared with: of the parameters where f is a
+posterior's, of the outcome by other parameters where it is a likelihood's, and of
+nothing where it is a ratio.
 """
 
 from __future__ import annotations
@@ -94,6 +96,40 @@ def _ordered(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Return the arguments in the order of a model's method."""
     return (x, theta, action) if name == "log_likelihood" else (theta, x, action)
+
+
+class PosteriorGain(_Critic):
+    r"""Barber-Agakov bound, the utility of ASBI.
+
+    .. math::
+        U(\xi) = \frac{1}{M} \sum_{i=1}^M
+        \log q(\theta_i | x_i, \xi) - \log p(\theta_i)
+        \qquad \text{(Eqs. 12-13)}
+
+    with :math:`\theta_i \sim p`, :math:`x_i \sim p(x | \theta_i, \xi)`. For any q,
+    :math:`E[U(\xi)] = I(\theta; x | \xi) - E[\mathrm{KL}(p(\theta | x, \xi) \| q)]`,
+    so on simulations that q was not trained on it is a lower bound. Its slack differs
+    by action: ranking by it is not ranking by information where q is blunter for one
+    action than for another. Outcomes at the same parameters are averaged, as they are
+    not independent.
+
+    The model has ``log_posterior(theta, x, action)``, the log density of every row,
+    shape (n,).
+
+    References:
+        Kim & Matsubara, Applied Intelligence 2025; Barber & Agakov, NeurIPS 2003.
+    """
+
+    bound: Bound = "lower"
+    functions = ("log_posterior",)
+
+    @override
+    def _contributions(
+        self, model: Any, simulations: CandidateSimulations, belief: Distribution
+    ) -> Tensor:
+        density = getattr(belief, "smooth_log_prob", belief.log_prob)
+        log_q = super()._contributions(model, simulations, belief)
+        return log_q - density(simulations.theta)
 
 
 class RatioGain(_Critic):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -11,7 +10,7 @@ from torch import Tensor
 
 from sbi_active.arrays import Array
 from sbi_active.design.estimators.base import CandidateSimulations
-from sbi_active.inference.sampling.mixtures import StudentMixture, lower_factors
+from sbi_active.inference.sampling.mixtures import StudentMixture, fitted_normals
 from sbi_active.inference.sampling.weights import silverman
 
 NUM_FOLDS = 4  # a choice: fits of three quarters of the rows, four times
@@ -67,136 +66,89 @@ def by_pattern(
             yield a, members, torch.empty(0).long(), x[members, :0]
 
 
-@dataclass(frozen=True)
-class Reduction:
-    r"""Standardized outcomes, or the directions of them that predict the target.
+Reduction = Callable[[Tensor], Tensor]
+
+
+def reduction(
+    x: Tensor, target: Tensor, *, most: int = 6, ridge: float = 0.01, limit: float = 8.0
+) -> Reduction:
+    """Return a function that standardizes outcomes, and makes long ones short.
 
     Long outcomes are projected on the slopes of ridge regressions of the target's
-    numbers on x, and on the leading principal components, six in all.
+    numbers on x, and on the leading principal components.
 
-    Attributes:
-        center: Center of the outcomes, shape (q,).
-        scale: Scale of the outcomes, shape (q,).
-        direction: Directions, shape (q, r).
+    Args:
+        x: Outcomes, shape (n, q).
+        target: Numbers to predict, shape (n, t).
+        most: Numbers that are left of an outcome.
+        ridge: Share of the total variance that a direction is penalized by.
         limit: Standard deviations beyond which a number is cut off.
     """
+    n, q = x.shape
+    if q == 0:
+        return lambda new: new
+    center, scale = x.mean(0), x.std(0)
+    scale = torch.where(scale > 1e-30, scale, 1.0)
 
-    center: Tensor
-    scale: Tensor
-    direction: Tensor
-    limit: float = 8.0
+    def standard(new: Tensor) -> Tensor:
+        return ((new - center) / scale).clamp(-limit, limit)
 
-    @staticmethod
-    def fit(
-        x: Tensor, target: Tensor, *, most: int = 6, ridge: float = 0.01
-    ) -> Reduction:
-        """Fit to outcomes (n, q) and numbers to predict (n, t).
+    if q <= most:
+        return standard
+    z = (x - center) / scale
+    moment = z.T @ z / n + ridge * torch.eye(q)
+    slope = torch.linalg.solve(moment, z.T @ (target - target.mean(0)) / n)
+    left, value, _ = torch.linalg.svd(slope, full_matrices=False)
+    slope = left[:, value > 1e-9 * value.amax()][:, : most - 2]
+    leading = torch.linalg.eigh(moment).eigenvectors.flip(1)[:, :most]
+    direction = torch.linalg.qr(torch.cat([slope, leading], 1)).Q[:, :most]
+    direction = direction / (z @ direction).std(0)
+    return lambda new: (standard(new) @ direction).clamp(-limit, limit)
 
-        Outcomes of at most ``most`` numbers need no reduction. The ridge is the share
-        of the total variance that a direction is penalized by.
-        """
-        n, q = x.shape
-        center, scale = x.mean(0), x.std(0)
-        scale = torch.where(scale > 1e-30, scale, 1.0)
-        z = (x - center) / scale
-        if q <= most:
-            return Reduction(center, scale, torch.eye(q, dtype=x.dtype))
-        moment = z.T @ z / n + ridge * torch.eye(q)
-        slope = torch.linalg.solve(moment, z.T @ (target - target.mean(0)) / n)
-        left, value, _ = torch.linalg.svd(slope, full_matrices=False)
-        slope = left[:, value > 1e-9 * value.amax()][:, : most - 2]
-        leading = torch.linalg.eigh(moment).eigenvectors.flip(1)[:, :most]
-        direction = torch.linalg.qr(torch.cat([slope, leading], 1)).Q[:, :most]
-        return Reduction(center, scale, direction / (z @ direction).std(0))
 
-    def standard(self, x: Tensor) -> Tensor:
-        """Return all numbers standardized, shape (n, q)."""
-        return ((x - self.center) / self.scale).clamp(-self.limit, self.limit)
-
-    def __call__(self, x: Tensor) -> Tensor:
-        """Return the reduced outcomes, shape (n, r)."""
-        return (self.standard(x) @ self.direction).clamp(-self.limit, self.limit)
+def mixture(rows: Tensor, most: int) -> StudentMixture:
+    """Fit a mixture of at most so many normals to rows (n, d)."""
+    rng = np.random.default_rng(0)
+    return fitted_normals(rows.numpy(), most, rng, num_iterations=40)
 
 
 LogDensities = Callable[[Tensor], Tensor]
 
 
 def class_members(
-    x: Tensor,
-    label: Tensor,
-    enough: Tensor,
-    *,
-    kernels: bool = True,
-    bandwidths: tuple[float, ...] = (0.5, 1.0),
-    shrinkage: float = 5.0,
+    x: Tensor, label: Tensor, enough: Tensor, *, sizes: tuple[int, ...] = (1, 6)
 ) -> list[LogDensities]:
-    """Fit relative densities of each class, in several ways.
-
-    The order is: none; normals with a covariance each, shrunk to the common one; kernel
-    densities with these covariances.
+    """Fit relative densities of each class: none, and mixtures of normals.
 
     Args:
         x: Outcomes, shape (n, q), q may be 0.
         label: Class, shape (n,).
         enough: Whether a class has rows enough for a density, shape (k,), bool; where
             one has not, only the first is fitted.
-        kernels: Whether to fit kernel densities, the dearest ones.
-        bandwidths: Bandwidths, in those of Silverman's rule.
-        shrinkage: Rows' worth of the common covariance in that of a class.
+        sizes: Numbers of normals of a class.
 
     Returns:
         Functions of outcomes (m, q) that give log densities up to what is common to
         the classes, shape (m, k).
     """
-    num_classes = len(enough)
+    classes = range(len(enough))
     members: list[LogDensities] = [
-        lambda new: torch.zeros(len(new), num_classes, dtype=torch.float64)
+        lambda new: torch.zeros(len(new), len(classes), dtype=torch.float64)
     ]
     if x.shape[1] == 0 or not bool(enough.all()):
         return members
-    reduction = Reduction.fit(x, torch.nn.functional.one_hot(label).double())
-
-    def reduce(new: Tensor) -> Array:
-        return reduction(new).numpy()
-
-    z = reduce(x)
-    rows = [z[(label == k).numpy()] for k in range(num_classes)]
-    scatter = np.stack([(r - r.mean(0)).T @ (r - r.mean(0)) for r in rows])
-    tiny = np.diag(1e-8 * np.maximum(z.var(0), 1e-30))
-    common = scatter.sum(0) / (len(z) - num_classes) + tiny
-    count = np.array([len(row) for row in rows])[:, None, None]
-    shrunk = (scatter + shrinkage * common) / (count - 1 + shrinkage) + tiny
-    pairs = [*zip(rows, lower_factors(shrunk), strict=True)]
-    fits = [
-        [StudentMixture(r.mean(0)[None], f[None], freedom=np.inf) for r, f in pairs]
-    ]
-    for width in bandwidths if kernels else ():
-        widths = [width * silverman(*r.shape) for r in rows]
-        each = zip(pairs, widths, strict=True)
-        fits.append(
-            [_kernels(r, h * f[None].repeat(len(r), 0), f) for (r, f), h in each]
-        )
+    reduce = reduction(x, torch.nn.functional.one_hot(label).double())
+    rows = [reduce(x[label == k]) for k in classes]
+    fits = [[mixture(own, size) for own in rows] for size in sizes]
     return members + [_by_class(fit, reduce) for fit in fits]
 
 
-def _by_class(
-    mixtures: Sequence[StudentMixture], reduce: Callable[[Tensor], Array]
-) -> LogDensities:
+def _by_class(mixtures: Sequence[StudentMixture], reduce: Reduction) -> LogDensities:
     def log_density(x: Tensor) -> Tensor:
-        z = reduce(x)
+        z = reduce(x).numpy()
         return torch.from_numpy(np.stack([m.log_prob(z) for m in mixtures], 1))
 
     return log_density
-
-
-def _kernels(
-    knots: Array, factors: Array, wide: Array, *, tail: float = 0.1
-) -> StudentMixture:
-    """Return normal kernels, and a normal of all draws for what lies between them."""
-    n = len(knots)
-    weights = np.append(np.full(n, (1 - tail) / n), tail)
-    means = np.concatenate([knots, knots.mean(0)[None]])
-    return StudentMixture(means, np.concatenate([factors, wide[None]]), weights, np.inf)
 
 
 #: Numbers of an outcome up to which each kernel has a covariance of its own.
@@ -236,27 +188,33 @@ def noise_members(
     known = mean.numpy(), sd.square().numpy()
     classes = [(label == k).numpy() for k in range(len(enough))]
     fits = [_noise_kernels(*(part[own] for part in known)) for own in classes]
-    return [_by_class(fits, lambda new: new.numpy())]
+    return [_by_class(fits, lambda new: new)]
 
 
 def _noise_kernels(
-    mean: Array, variance: Array, *, factor: float = 0.25
+    mean: Array, variance: Array, *, factor: float = 0.25, tail: float = 0.1
 ) -> StudentMixture:
     """Return the density of one class, by means and variances (n, q).
 
-    The factor is that of Silverman's rule; with one four times as large, the
-    information of six pairs of models was the same to .007 nat.
+    Args:
+        mean: Outcomes without noise.
+        variance: Variances of the noise.
+        factor: Factor of Silverman's rule; with one four times as large, the
+            information of six pairs of models was the same to .007 nat.
+        tail: Weight of a normal of all draws, for what lies between the kernels.
     """
-    apart = mean - mean.mean(0)
-    covariance = apart.T @ apart / (len(mean) - 1)
+    center, n = mean.mean(0), len(mean)
+    apart = mean - center
+    covariance = apart.T @ apart / (n - 1)
     # directions in which the kernels would lie apart without smoothing
     unit = variance.mean(0) ** -0.5
     spread = np.linalg.eigvalsh(unit[:, None] * covariance * unit)
     num_distinct = len({row.tobytes() for row in mean})
     d = max(1, int((spread > 1).sum()))
     h = min(factor * silverman(max(2, num_distinct), d), 1.0)
-    knots = mean.mean(0) + np.sqrt(1 - h**2) * apart
-    one = np.eye(mean.shape[1])
-    factors = np.linalg.cholesky(variance[:, None] * one + h**2 * covariance)
-    wide = np.linalg.cholesky(variance.mean(0) * one + covariance)
-    return _kernels(knots, factors, wide)
+    knots = np.append(np.sqrt(1 - h**2) * apart, 0 * apart[:1], 0)
+    own = variance[:, None] * np.eye(len(center)) + h**2 * covariance
+    wide = variance.mean(0) * np.eye(len(center)) + covariance
+    factors = np.linalg.cholesky(np.append(own, wide[None], 0))
+    weights = np.append(np.full(n, (1 - tail) / n), tail)
+    return StudentMixture(center + knots, factors, weights, np.inf)

@@ -10,13 +10,14 @@ import torch
 from torch import Tensor
 from torch.distributions import Distribution
 
-from sbi_active.design.estimators.emulator import Emulated, MeanEmulator
+from sbi_active.design.estimators.emulator import Emulated, MeanEmulator, whitening
+from sbi_active.inference.sampling.mixtures import log_student
 from sbi_active.seeding import forked_generators
 from sbi_active.simulation import GaussianNoise, NoiseModel
 from sbi_active.support import within_support
 
 
-@dataclass(frozen=True)
+@dataclass
 class Evidence:
     """The log evidence of outcomes of one candidate, log p(x_i).
 
@@ -50,32 +51,14 @@ class Evidence:
     closer: float = 0.2
     rare: float = 0.5
 
-    @cached_property
-    def mean(self) -> Tensor:
-        """Outcomes of the simulations without noise."""
-        assert self.known.simulations.mean is not None
-        return self.known.simulations.mean[self.candidate].double()
-
-    @cached_property
-    def noise(self) -> NoiseModel:
-        """Noise around the mean."""
-        assert self.known.simulations.noise is not None
-        return self.known.simulations.noise
-
-    @cached_property
-    def counted(self) -> Tensor:
-        """Simulations that are not missing, shape (n,), bool."""
-        return self.known.simulations.counted[self.candidate]
-
-    @cached_property
-    def scale(self) -> Tensor:
-        """Scale of the noise of each number."""
-        return self.known.scale[self.candidate]
-
-    @cached_property
-    def knots(self) -> Tensor:
-        """Coordinates of the simulations, shape (n, d)."""
-        return self.known.emulator.knots
+    def __post_init__(self) -> None:
+        simulations, a = self.known.simulations, self.candidate
+        assert simulations.mean is not None
+        assert simulations.noise is not None
+        self.noise = simulations.noise
+        self.x, self.mean = simulations.x[a].double(), simulations.mean[a].double()
+        self.counted, self.scale = simulations.counted[a], self.known.scale[a]
+        self.knots = self.known.emulator.knots
 
     @cached_property
     def log_belief(self) -> Tensor:
@@ -94,19 +77,18 @@ class Evidence:
             p(x_i) \ge p(x_i | \theta_i)\, b(\theta_i)\, (\pi / 2)^{d / 2}
             \left| J^\top J + \Sigma^{-1} \right|^{-1/2} .
         """
-        x = self.known.simulations.x[self.candidate].double()
         m, num_local = int(self.counted.sum()) - 1, self.num_local
         parts = []
         influence, local = torch.zeros(2, len(self.knots), dtype=torch.float64)
         with forked_generators(0):  # the same base draws for all candidates
             for some in rows.split(256):
-                shared = self._shared(x, some)
+                shared = self._shared(some)
                 weight = shared.softmax(1)
                 log_p, variance = _log_mean(shared, m, m)
                 poor = torch.nonzero(~(variance + 1 / m <= 1 / self.enough))[:, 0]
                 if len(poor):
                     i = some[poor]
-                    terms, least = self._with_local(x[i], slope[i], i, shared[poor])
+                    terms, least = self._with_local(slope[i], i, shared[poor])
                     log_q, spread = _log_mean(terms, m, m + num_local)
                     own = terms.softmax(1).nan_to_num()
                     weight[poor] = own[:, :-num_local]
@@ -118,22 +100,24 @@ class Evidence:
                 influence += self.share[some] @ weight.nan_to_num()
         return torch.cat(parts), influence, local
 
-    def _shared(self, x: Tensor, rows: Tensor) -> Tensor:
+    def _shared(self, rows: Tensor) -> Tensor:
         """Log density p(x_i | theta_j), -inf for j = i, shape (rows, n)."""
+        x = self.x[rows]
         known = (self.share > 0).reshape(-1, *[1] * (x.ndim - 1))
         mean = torch.where(known, self.mean, 0)
-        log_term = _pairwise(self.noise, x[rows], mean)
+        log_term = _pairwise(self.noise, x, mean)
         log_term += self.share.log()
         log_term[torch.arange(len(rows)), rows] = -torch.inf
         return log_term
 
     def _with_local(
-        self, x: Tensor, slope: Tensor, i: Tensor, shared: Tensor
+        self, slope: Tensor, i: Tensor, shared: Tensor
     ) -> tuple[Tensor, Tensor]:
         """Log terms of the sum of simulations and local draws, shape (i, n + l).
 
         Beside them is the least that the evidences may be, shape (i,).
         """
+        x = self.x[i]
         location, precision = self._linearized(x, slope, i)
         factor = self.wider * torch.linalg.cholesky(torch.linalg.inv(precision))
         (n, d), num_local = location.shape, self.num_local
@@ -198,8 +182,8 @@ class Evidence:
         The belief enters as the Gaussian of its draws' moments. A step is kept where
         it does not raise the misfit.
         """
-        z, center = self.knots[i], self.knots.mean(0)
-        prior = precision_of(self.knots)
+        z, (center, white) = self.knots[i], whitening(self.knots)
+        prior = white @ white.mT
 
         def misfit(z: Tensor, outcome: Tensor) -> Tensor:
             residual = x.flatten(1) / self.scale - outcome
@@ -215,13 +199,6 @@ class Evidence:
         after = self._outcomes(moved[:, None], slope, i)[:, 0]
         better = misfit(moved, after) < misfit(z, own)
         return torch.where(better[:, None], moved, z), precision
-
-
-def precision_of(theta: Tensor) -> Tensor:
-    """Return the inverse covariance of parameters (n, d) of about unit size, (d, d)."""
-    d = theta.shape[1]
-    spread = torch.cov(theta.T).reshape(d, d) + 1e-9 * torch.eye(d)
-    return torch.linalg.inv(spread)
 
 
 def _pairwise(noise: NoiseModel, x: Tensor, mean: Tensor) -> Tensor:
@@ -267,10 +244,7 @@ def _student(shape: tuple[int, ...], degrees: int) -> Tensor:
 
 def _log_student(offset: Tensor, factor: Tensor, degrees: int) -> Tensor:
     """Log density at offsets (n, k, d) with lower factors (n, d, d)."""
-    d = offset.shape[-1]
-    inverse = torch.linalg.inv(factor)
-    square = (offset @ inverse.mT).square().sum(-1)
-    norm = math.lgamma((degrees + d) / 2) - math.lgamma(degrees / 2)
-    norm -= 0.5 * d * math.log(degrees * math.pi)
-    log_det = inverse.diagonal(dim1=-2, dim2=-1).log().sum(-1, keepdim=True)
-    return norm + log_det - 0.5 * (degrees + d) * torch.log1p(square / degrees)
+    square = (offset @ torch.linalg.inv(factor).mT).square().sum(-1)
+    log_volume = factor.diagonal(dim1=-2, dim2=-1).log().sum(-1, keepdim=True)
+    known = square.numpy(), log_volume.numpy(), offset.shape[-1], degrees
+    return torch.from_numpy(log_student(*known))

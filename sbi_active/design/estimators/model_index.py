@@ -115,16 +115,19 @@ class RivalSampler:
         rows = []
         for own in action:
             drawn = [self._predict(k, own, each, seed) for k in range(num_rivals)]
-            shapes = [tuple(part.shape[1:]) for part in drawn]
+            shapes = [tuple(part.shape) for parts in drawn for part in parts]
             if len({*shapes}) > 1 or shapes[0][:1] != (each,):
                 raise ValueError(
-                    f"expected {each} outcomes of one shape from all rivals; got "
-                    f"{shapes}; return one row a draw, and predict the same x"
+                    f"expected {each} outcomes of one shape from all rivals, and such "
+                    f"means and deviations; got {shapes}; return one row a draw, and "
+                    "predict the same x"
                 )
-            rows.append(torch.stack(drawn, 2).flatten(1, 2))
-        self.num_drawn += len(rows) * rows[0].shape[1]
+            each_kind = zip(*drawn, strict=True)
+            rows.append(torch.stack([torch.stack(kind, 1) for kind in each_kind]))
+        every = torch.stack(rows, 1).flatten(2, 3)
+        self.num_drawn += len(action) * every.shape[2]
         index = torch.arange(num_rivals).repeat(each)[:, None]
-        x, *noise = torch.stack(rows, 1)
+        x, *noise = every if every.ndim > 3 else every[..., None]
         mean, sd = noise or (None, None)
         return CandidateSimulations(index, action, x, mean, sd=sd)
 
@@ -132,28 +135,16 @@ class RivalSampler:
         """Repeat the draws of the first call in the next."""
         self._num_waves = 0
 
-    def _predict(self, k: int, action: Tensor, num: int, seed: int) -> Tensor:
-        """Return outcomes, and where all rivals know them means and deviations.
-
-        Shape (1 or 3, n, *x_shape).
-        """
+    def _predict(self, k: int, action: Tensor, num: int, seed: int) -> list[Tensor]:
+        """Return outcomes, and where all rivals know them means and deviations."""
         rival: Any = self.rivals[k]
-        own = derive_seed(seed, k)
-        parts = [torch.as_tensor(rival.predict(action, num, own))]
-        if self._is_noisy:
-            parts += [torch.as_tensor(p) for p in rival.predict_mean(action, num, own)]
-        x = parts[0]
-        if any(part.shape != x.shape for part in parts):
-            raise ValueError(
-                f"expected means and deviations of shape {tuple(x.shape)} from rival "
-                f"{k}; got {[tuple(p.shape) for p in parts[1:]]}; return one of each "
-                "a number"
-            )
+        given = action, num, derive_seed(seed, k)
+        noise = rival.predict_mean(*given) if self._is_noisy else ()
+        parts = [torch.as_tensor(part) for part in (rival.predict(*given), *noise)]
         # kernels as narrow as the noise need what a float loses of a large number
-        exact = self._is_noisy and x[0].numel() <= MOST_NUMBERS
+        exact = self._is_noisy and parts[0][0].numel() <= MOST_NUMBERS
         dtype = torch.float64 if exact else torch.float32
-        stacked = torch.stack([part.to(dtype) for part in parts])
-        return stacked[:, :, None] if x.ndim == 1 else stacked
+        return [part.to(dtype) for part in parts]
 
 
 class ModelIndexGain(InformationGainEstimator):
@@ -165,7 +156,7 @@ class ModelIndexGain(InformationGainEstimator):
         q(k | x, \xi) \propto p_k\, P_k(v)\, f_k(x | v)^{\beta}
 
     with v the numbers of x that are present, P_k(v) their share among the model's
-    draws, and f_k a density of them: Gaussian or by kernels, of a few discriminating
+    draws, and f_k a density of them: a mixture of normals, of a few discriminating
     numbers where x is long; :math:`\beta \le 1` tempers it. Where the
     rivals know their noise and x is short, kernels at the outcomes without noise are as
     narrow as the noise. All are fitted to three quarters of the draws and score the
@@ -245,7 +236,7 @@ class ModelIndexGain(InformationGainEstimator):
             if len(noise) == 2:
                 center, width = (part[train] for part in noise)
                 narrow = noise_members(center, width, own[train], enough)
-            wide = class_members(x[train], own[train], enough, kernels=not narrow)
+            wide = class_members(x[train], own[train], enough)
             scores = []
             for member in [*wide, *narrow]:
                 log_f = member(x[test])

@@ -15,7 +15,7 @@ from sbi_active.design.estimators.base import (
     InformationGainEstimator,
     at_least,
 )
-from sbi_active.design.estimators.emulator import emulated, learned
+from sbi_active.design.estimators.emulator import emulated, learned, whitening
 from sbi_active.design.estimators.entropy import (
     EntropyGain,
     conditional_entropy,
@@ -24,7 +24,7 @@ from sbi_active.design.estimators.entropy import (
     presence_problems,
     with_control,
 )
-from sbi_active.design.estimators.evidence import Evidence, precision_of
+from sbi_active.design.estimators.evidence import Evidence
 
 
 class NestedGain(InformationGainEstimator):
@@ -202,7 +202,8 @@ def _excess(slope: Tensor, fisher: Tensor, theta: Tensor, local: Tensor) -> Tens
     if int(known.sum()) < 2:
         return torch.zeros_like(local)
     scale = theta.std(0)
-    prior = precision_of(theta / scale)
+    _, white = whitening(theta / scale)
+    prior = white @ white.mT
     both = torch.stack([slope[known].mT @ slope[known], fisher[known]])
     entropy = 0.5 * torch.logdet(both * scale[:, None] * scale + prior)
     excess = local[known] * (entropy[0] - entropy[1])
