@@ -29,13 +29,16 @@ r"""Model selection and effect attribution under misspecification.
    and if the error beyond the sensor's at least halves by it: u is at most a quarter of
 
 .. math::
-    u = \max\left(\frac{r - 1}{r_{-e} - 1}, \frac{r - 1}{r_0 - 1}\right),
+    u = \max\left(\frac{r - w}{r_{-e} - w}, \frac{r - w}{r_0 - w}\right),
 
 from mean squared residuals r of fits in sensor variances: of the set, of the set
-without the effect and of the bare model. What is left out tells less of it, since a few
-trials to which a fit extrapolates hold most of that error. Neither number changes with
-the unit of x, the order of the effects, or others that explain nothing, and hardly with
-the declared size of the sensor's error: ``benchmarks/misfit/metamorphic.py``.
+without the effect and of the bare model. w is the least variance of what is white in
+these residuals along trajectories (:func:`.white_variance`), or one if that is more: a
+sensor that was declared too fine has an error that no effect could leave out. What is
+left out tells less of it, since a few trials to which a fit extrapolates hold most of
+that error. Neither number changes with the unit of x, the order of the effects, or
+others that explain nothing, and hardly with the declared size of the sensor's error:
+``benchmarks/misfit/metamorphic.py``.
 """
 
 from __future__ import annotations
@@ -335,8 +338,9 @@ class Compared:
 
     def _remains(self, key: ModelKey, name: str) -> float:
         """Return u, the share of the excess error that an effect of a set leaves."""
-        every = key, key.without(name), ModelKey()
-        own, other, bare = (self.models[k].excess for k in every)
+        every = [self.models[k] for k in (key, key.without(name), ModelKey())]
+        white = min(model.white for model in every)
+        own, other, bare = (model.excess(white) for model in every)
         return float(np.clip(max(own / other, own / bare), 0.0, 1.0))
 
 
