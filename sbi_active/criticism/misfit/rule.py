@@ -32,11 +32,12 @@ r"""Model selection and effect attribution under misspecification.
     u = \max\left(\frac{r - w}{r_{-e} - w}, \frac{r - w}{r_0 - w}\right),
 
 from mean squared residuals r of fits in sensor variances: of the set, of the set
-without the effect and of the bare model. w is the least variance of what is white in
-these residuals along trajectories (:func:`.white_variance`), or one if that is more: a
-sensor that was declared too fine has an error that no effect could leave out. What is
-left out tells less of it, since a few trials to which a fit extrapolates hold most of
-that error. Neither number changes with the unit of x, the order of the effects, or
+without the effect and of the bare model. w is one; where the set's errors are likeliest
+larger without structure, as those of a sensor that was declared too fine, it is what is
+white in its residual (:func:`.white_variance`), which no effect could leave out. In
+each state it would be too much: of samples that are far apart all looks white. What is
+left out tells less of the error, since a few trials to which a fit extrapolates hold
+most of it. Neither number changes with the unit of x, the order of the effects, or
 others that explain nothing, and hardly with the declared size of the sensor's error:
 ``benchmarks/misfit/metamorphic.py``.
 """
@@ -338,9 +339,8 @@ class Compared:
 
     def _remains(self, key: ModelKey, name: str) -> float:
         """Return u, the share of the excess error that an effect of a set leaves."""
-        every = [self.models[k] for k in (key, key.without(name), ModelKey())]
-        white = min(model.white for model in every)
-        own, other, bare = (model.excess(white) for model in every)
+        every, white = (key, key.without(name), ModelKey()), self.models[key].white
+        own, other, bare = (self.models[k].excess(white) for k in every)
         return float(np.clip(max(own / other, own / bare), 0.0, 1.0))
 
 

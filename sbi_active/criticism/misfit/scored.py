@@ -43,8 +43,8 @@ class Scored:
             sensor or of a declared effect, or a catch-all.
         beside: Unnormalized log posterior probability beside a residual process, or a
             parameter that differs from trial to trial; NaN takes ``log_p``.
-        white: Variance of what is white in the fit's residual, in sensor variances, or
-            one if that is more.
+        white: Variance of the white error, in sensor variances: one, or where errors
+            are larger without structure what is white in the fit's residual.
     """
 
     log_p: float

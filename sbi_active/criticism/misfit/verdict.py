@@ -163,8 +163,10 @@ class Verdict:
             beside = mixture(c.model, c.grams, use, beside=True, factor=factor)
         square = (standard or self.standard)(c)
         log_beside = c.log_prior + beside.log_evidence
-        m, fold = self.search.errors.measurements, self.search.errors.fold
-        white = max(white_variance(c.model.residual[: c.model.num], m, fold), 1.0)
+        white, m = 1.0, self.search.errors.measurements
+        if state == SCATTER:
+            residual = c.model.residual[: c.model.num]
+            white = max(white_variance(residual, m, self.search.errors.fold), 1.0)
         return Scored(log_p, square, c.model.rms**2, state, log_beside, white)
 
     def _settled(
