@@ -198,6 +198,28 @@ def alike(m: Measurements, fold: NDArray[np.int64]) -> list[NDArray[np.intp]]:
     return [np.stack(series) for series in same.values()]
 
 
+def white_variance(residual: Array, m: Measurements, fold: NDArray[np.int64]) -> float:
+    r"""Return the variance of what is white in residuals, by their second differences.
+
+    .. math::
+        \frac16 \overline{(r_{i - 1} - 2 r_i + r_{i + 1})^2}
+
+    It does not ask how large the sensor's error was declared. Of what lasts for some
+    samples little is in it; zero where no three numbers follow each other.
+
+    Args:
+        residual: Residuals, shape (N,).
+        m: Measurements in the order trial, channel, time.
+        fold: Part of each number, shape (N,); it starts a new series.
+
+    References:
+        Gasser, Sroka & Jennen-Steinmetz, Biometrika 73 (1986).
+    """
+    second = [np.diff(residual[at], 2) for at in series_of(m, fold)]
+    every = np.concatenate(second)
+    return float(np.mean(every**2) / 6) if len(every) else 0.0
+
+
 def time_scales(m: Measurements, fold: NDArray[np.int64]) -> Array:
     """Return the time scales that some measurements tell apart, shape (t,).
 

@@ -29,13 +29,17 @@ r"""Model selection and effect attribution under misspecification.
    and if the error beyond the sensor's at least halves by it: u is at most a quarter of
 
 .. math::
-    u = \max\left(\frac{r - 1}{r_{-e} - 1}, \frac{r - 1}{r_0 - 1}\right),
+    u = \max\left(\frac{r - w}{r_{-e} - w}, \frac{r - w}{r_0 - w}\right),
 
 from mean squared residuals r of fits in sensor variances: of the set, of the set
-without the effect and of the bare model. What is left out tells less of it, since a few
-trials to which a fit extrapolates hold most of that error. Neither number changes with
-the unit of x, the order of the effects, or others that explain nothing, and hardly with
-the declared size of the sensor's error: ``benchmarks/misfit/metamorphic.py``.
+without the effect and of the bare model. w is one; where the set's errors are likeliest
+larger without structure, as those of a sensor that was declared too fine, it is what is
+white in its residual (:func:`.white_variance`), which no effect could leave out. In
+each state it would be too much: of samples that are far apart all looks white. What is
+left out tells less of the error, since a few trials to which a fit extrapolates hold
+most of it. Neither number changes with the unit of x, the order of the effects, or
+others that explain nothing, and hardly with the declared size of the sensor's error:
+``benchmarks/misfit/metamorphic.py``.
 """
 
 from __future__ import annotations
@@ -335,8 +339,8 @@ class Compared:
 
     def _remains(self, key: ModelKey, name: str) -> float:
         """Return u, the share of the excess error that an effect of a set leaves."""
-        every = key, key.without(name), ModelKey()
-        own, other, bare = (self.models[k].excess for k in every)
+        every, white = (key, key.without(name), ModelKey()), self.models[key].white
+        own, other, bare = (self.models[k].excess(white) for k in every)
         return float(np.clip(max(own / other, own / bare), 0.0, 1.0))
 
 

@@ -43,6 +43,8 @@ class Scored:
             sensor or of a declared effect, or a catch-all.
         beside: Unnormalized log posterior probability beside a residual process, or a
             parameter that differs from trial to trial; NaN takes ``log_p``.
+        white: Variance of the white error, in sensor variances: one, or where errors
+            are larger without structure what is white in the fit's residual.
     """
 
     log_p: float
@@ -50,6 +52,7 @@ class Scored:
     fitted: float
     state: str | None = UNEXPLAINED
     beside: float = np.nan
+    white: float = 1.0
 
     @property
     def error(self) -> float:
@@ -66,10 +69,9 @@ class Scored:
         """Whether it leaves the sensor's error, with or without one gross error."""
         return self.state in (None, OUTLIER)
 
-    @property
-    def excess(self) -> float:
-        """Excess of the fit's residual beyond the sensor's error."""
-        return max(self.fitted - 1, 1e-2)  # so that ratios are finite
+    def excess(self, white: float) -> float:
+        """Return the excess of the fit's residual beyond a white error's variance."""
+        return max(self.fitted - white, 1e-2)  # so that ratios are finite
 
 
 def predicts_better(one: Array, other: Array) -> float:

@@ -22,6 +22,7 @@ from sbi_active.criticism.effects.effect import Effect
 from sbi_active.criticism.forces.library import is_force
 from sbi_active.criticism.linear.left_out import Candidate, standard_errors
 from sbi_active.criticism.linear.model import LinearModel
+from sbi_active.criticism.linear.processes import white_variance
 from sbi_active.criticism.linear.search import Search
 from sbi_active.criticism.linear.states import States
 from sbi_active.criticism.misfit.guesses import gained_by_guesses
@@ -162,7 +163,11 @@ class Verdict:
             beside = mixture(c.model, c.grams, use, beside=True, factor=factor)
         square = (standard or self.standard)(c)
         log_beside = c.log_prior + beside.log_evidence
-        return Scored(log_p, square, c.model.rms**2, state, log_beside)
+        white, m = 1.0, self.search.errors.measurements
+        if state == SCATTER:
+            residual = c.model.residual[: c.model.num]
+            white = max(white_variance(residual, m, self.search.errors.fold), 1.0)
+        return Scored(log_p, square, c.model.rms**2, state, log_beside, white)
 
     def _settled(
         self,

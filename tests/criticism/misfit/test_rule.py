@@ -113,6 +113,18 @@ def test_support_is_of_the_fit_and_needs_no_other_effects():
     assert more.support["a"] == choice(HALVED | {"b": (-1.0, 101.0)}).support["a"]
 
 
+def test_a_sensor_declared_too_fine_keeps_no_effect_from_being_named():
+    """Of the sensor's own error nothing can be left out."""
+    for size in (1.0, 100.0):
+        models = {
+            ModelKey(): Scored(0.0, size * TEN, 4 * size, white=size),
+            ModelKey(("a",)): Scored(20.0, size * EVEN, 1.5 * size, white=size),
+        }
+        found = Compared(Rule(), models, "a").choice()
+        assert found.support["a"].remains == pytest.approx(0.5 / 3)
+        assert found.named == ("a",)
+
+
 def test_formulas_in_the_place_of_an_effect_compete_with_it():
     errors = {"-": (0, 101.0), "a": (20, 2.0), "b": (19, 2.1), "ab": (39, 1.1)}
     asked = []

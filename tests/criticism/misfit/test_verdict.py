@@ -14,7 +14,7 @@ from sbi_active.criticism.forces import force_effects
 from sbi_active.criticism.results import SCATTER, UNEXPLAINED, ModelKey
 from sbi_active.criticism.steps.detection import REFUTED
 from tests.criticism.forces.test_forces import MODEL, PRIOR, SD, measured
-from tests.criticism.misfit.oscillator import EFFECTS
+from tests.criticism.misfit.oscillator import EFFECTS, SENSOR, TIMES, oscillate
 from tests.criticism.misfit.oscillator import MODEL as OSCILLATOR
 from tests.criticism.misfit.oscillator import PRIOR as RATES
 from tests.criticism.misfit.oscillator import trials as oscillations
@@ -65,6 +65,17 @@ def test_linear_evidence_is_that_of_samples():
     linear = [tracing.evidences[k].log_evidence for k in ("none", "bias")]
     # The bare model, hundreds of nats behind, is linear no more: hence the share.
     assert np.diff(linear) == pytest.approx(np.diff(sampled), abs=1.0, rel=0.01)
+
+
+@pytest.mark.parametrize("finer", [1, 10])
+def test_a_small_bias_is_named_however_fine_the_sensor_is_declared(finer):
+    """It leaves most of the squares, which are the sensor's."""
+    noise = GaussianNoise(SENSOR / finer)
+    model = SimulatorModel(oscillate, noise=noise, sample_times=TIMES)
+    own = oscillations(bias=1.2 * SENSOR)
+    tracing = Criticism(model, RATES, own, effects=EFFECTS).trace()
+    assert tracing.verdict == "bias"
+    assert (tracing.misfit is not None) == (finer > 1)
 
 
 def test_what_is_asked_first_does_not_matter():
