@@ -5,7 +5,6 @@ A snippet whose first line is ``# name.py`` is a file, from which others may imp
 
 import re
 import sys
-from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -15,7 +14,7 @@ import torch
 from sbi_active import InformationGainDesigner
 from sbi_active.campaign.learning import planner
 from sbi_active.campaign.learning.learner import Learner
-from sbi_active.design import GradientSearch, designer
+from sbi_active.design import GradientSearch
 
 ROOT = Path(__file__).parents[1]
 FILE = re.compile(r"# (\w+)\.py\n")
@@ -65,8 +64,8 @@ def run(tmp_path, monkeypatch):
     def page(name: str) -> list[SimpleNamespace]:
         ran = []
         if name != "README.md":
-            quick = partial(GradientSearch, num_rounds=1, num_starts=4)
-            monkeypatch.setattr(designer, "GradientSearch", quick)
+            monkeypatch.setattr(GradientSearch, "num_rounds", 1)
+            monkeypatch.setattr(GradientSearch, "num_starts", 4)
             monkeypatch.setattr(planner, "InformationGainDesigner", of_few_simulations)
             monkeypatch.setattr(Learner, "trains_each_round", False)
         text = (ROOT / name).read_text()
