@@ -309,8 +309,11 @@ def listed(x: Any) -> Any:
     """Return an action or an outcome as :class:`Facts` have it."""
     if not hasattr(x, "numpy"):
         return x
-    numbers = x.numpy().astype(object)
-    numbers[x.isnan().numpy()] = None
+    numbers = x.numpy()
+    is_missing = numbers != numbers
+    if is_missing.any():
+        numbers = numbers.astype(object)
+        numbers[is_missing] = None
     return numbers.tolist()
 
 
@@ -318,7 +321,7 @@ def flat(value: Any) -> list[Any]:
     """Return the parts of nested lists."""
     if not isinstance(value, list):
         return [value]
-    if not any(isinstance(item, list) for item in value):  # at once, as of an image
+    if not (value and isinstance(value[0], list)):  # at once, as of an image
         return [*value]
     return [part for item in value for part in flat(item)]
 

@@ -305,13 +305,14 @@ def outcome_told(x: Any, x_shape: torch.Size) -> Tensor:
             f"expected one outcome of shape {tuple(x_shape)}; got {len(rows)}; tell "
             "one trial at a time"
         )
-    infinite = rows[0].isinf()
-    if bool(infinite.any()):
+    infinite = np.isinf(rows[0].numpy())
+    if infinite.any():
         warn(
-            f"SA201 {int(infinite.sum())} of {infinite.numel()} told numbers are "
-            "infinite and count as not measured; pass NaN where a sensor gave nothing"
+            f"SA201 {infinite.sum()} of {infinite.size} told numbers are infinite and "
+            "count as not measured; pass NaN where a sensor gave nothing"
         )
-    return torch.where(infinite, torch.nan, rows[0])
+        rows[0][infinite] = torch.nan
+    return rows[0]
 
 
 def _action_told(action: Any, action_dim: int) -> Tensor:

@@ -40,9 +40,16 @@ SCHEMA = (
     "CREATE TABLE records (kind TEXT NOT NULL, number INTEGER NOT NULL, digest BLOB "
     "NOT NULL, content BLOB NOT NULL, PRIMARY KEY (kind, number))"
 )
+#: A record is changed in its place: one that moved to the end would touch more pages.
+WRITE = (
+    "INSERT INTO records VALUES (?, ?, ?, ?) ON CONFLICT DO UPDATE "
+    "SET digest = excluded.digest, content = excluded.content"
+)
+#: The log is begun again after 64 pages: a commit that need not make it longer takes
+#: two thirds of the time. With 1,000, SQLite's default, most of a campaign's do.
 SETTINGS = (
-    "PRAGMA trusted_schema = OFF; PRAGMA cell_size_check = ON; "
-    "PRAGMA journal_mode = WAL; PRAGMA synchronous = FULL; BEGIN"
+    "PRAGMA trusted_schema = OFF; PRAGMA cell_size_check = ON; PRAGMA journal_mode = "
+    "WAL; PRAGMA wal_autocheckpoint = 64; PRAGMA synchronous = FULL; BEGIN"
 )
 #: Seconds to wait for a moment in which another process tidies up. A choice.
 PATIENCE = 10.0
@@ -200,9 +207,9 @@ class Store:
             LockedError: If another writer, in this process or another, has it.
             OSError: If the folder cannot be written.
         """
+        if self._lock is not None:
+            return
         with GUARD, sensible(self.folder / LOCK):
-            if self._lock is not None:
-                return
             lock = _connected(self.folder / LOCK, "rwc", timeout=0.1)
             # Nothing is written.
             lock.executescript("PRAGMA journal_mode = MEMORY; BEGIN EXCLUSIVE")
@@ -239,8 +246,10 @@ class Store:
 
     def seal(self, *ends: str) -> str:
         """Return a text that changes if the file does, or those of other endings."""
-        files = [f"{self.path}{end}" for end in ("", *ends)]
-        states = [os.stat(file) for file in files if os.path.exists(file)]
+        states = []
+        for end in ("", *ends):
+            with suppress(FileNotFoundError):
+                states.append(os.stat(f"{self.path}{end}"))
         return str([(s.st_ino, s.st_size, s.st_mtime_ns) for s in states])
 
     def put(self, kind: str, content: Any, number: int = 0) -> None:
@@ -365,7 +374,7 @@ def _insert(at: Any, name: int, kind: str, number: int, content: Any) -> None:
     if isinstance(content, dict):
         content = json.dumps(content, allow_nan=False).encode()
     row = (kind, number, _digest(name, kind, number, content), content)
-    at.execute("INSERT OR REPLACE INTO records VALUES (?, ?, ?, ?)", row)
+    at.execute(WRITE, row)
 
 
 def _digest(name: int, kind: str, number: int, content: bytes) -> bytes:
