@@ -82,15 +82,13 @@ class Bank(AbstractContextManager["Bank"]):
         version: str = "",
         name: str = "rows",
     ) -> None:
-        if not isinstance(path, Store):
-            path = Store(Path(path), make=simulator is not None)
-        self._store = path
+        makes = simulator is not None
+        self._store = path if isinstance(path, Store) else Store(Path(path), make=makes)
         self.path, self._name, self._key = self._store.folder, name, f"bank {name}"
         self._found: list[tuple[Array, str]] = []
         self._proposal: Distribution | None = None
-        self._mine: dict[str, Any] = {}  # the header of a new bank
-        if simulator is not None:
-            self._mine = {**fingerprint(simulator, version=version), "shapes": None}
+        own = fingerprint(simulator, version=version) if simulator is not None else {}
+        self._mine = own and {**own, "shapes": None}  # the header of a new bank
         _ = self.header
 
     def __exit__(self, *_: object) -> None:

@@ -32,8 +32,8 @@ from sbi_active.expected import require
 from sbi_active.messages import Explained
 
 NAME, FORMAT = "store.db", 4  # format 1 was folders of HDF5
-LOCK = "store.lock"  # empty: who writes holds SQLite's lock on it
-TEMPORARY = ".writing-"
+#: Of two files: an empty one, on which who writes holds SQLite's lock, and one begun.
+LOCK, TEMPORARY = "store.lock", ".writing-"
 CATALOG = "catalog"  # the last number of each kind
 #: The digest stands before the content, whose pages are then read only for it.
 SCHEMA = (
@@ -41,15 +41,11 @@ SCHEMA = (
     "NOT NULL, content BLOB NOT NULL, PRIMARY KEY (kind, number))"
 )
 #: A record is changed in its place: one that moved to the end would touch more pages.
-WRITE = (
-    "INSERT INTO records VALUES (?, ?, ?, ?) ON CONFLICT DO UPDATE "
-    "SET digest = excluded.digest, content = excluded.content"
-)
-#: The log is begun again after 64 pages: a commit that need not make it longer takes
-#: two thirds of the time. With 1,000, SQLite's default, most of a campaign's do.
+WRITE = "INSERT INTO records VALUES (?, ?, ?, ?) ON CONFLICT DO UPDATE SET "
+WRITE += "digest = excluded.digest, content = excluded.content"
 SETTINGS = (
-    "PRAGMA trusted_schema = OFF; PRAGMA cell_size_check = ON; PRAGMA journal_mode = "
-    "WAL; PRAGMA wal_autocheckpoint = 64; PRAGMA synchronous = FULL; BEGIN"
+    "PRAGMA trusted_schema = OFF; PRAGMA cell_size_check = ON; "
+    "PRAGMA journal_mode = WAL; PRAGMA synchronous = FULL; BEGIN"
 )
 #: Seconds to wait for a moment in which another process tidies up. A choice.
 PATIENCE = 10.0
@@ -246,10 +242,8 @@ class Store:
 
     def seal(self, *ends: str) -> str:
         """Return a text that changes if the file does, or those of other endings."""
-        states = []
-        for end in ("", *ends):
-            with suppress(FileNotFoundError):
-                states.append(os.stat(f"{self.path}{end}"))
+        files = [f"{self.path}{end}" for end in ("", *ends)]
+        states = [os.stat(file) for file in files if os.path.exists(file)]
         return str([(s.st_ino, s.st_size, s.st_mtime_ns) for s in states])
 
     def put(self, kind: str, content: Any, number: int = 0) -> None:
@@ -323,6 +317,12 @@ class Store:
         require(form == FORMAT, expected, got, "use the release that wrote it")
         is_own = tables == [(SCHEMA,), (None,)]  # the table, and the index of its key
         whole(path, is_own, "tables that are not those of a store")
+        if self._lock is not None:
+            # Into a log that need not grow, a commit takes half of the time or less.
+            # This is room for some fifty; where the disk has none, it is as well.
+            with suppress(OSError), open(f"{path}-wal", "r+b") as log:
+                if log.seek(0, os.SEEK_END) == 0:
+                    log.write(bytes(2**20))
         self._left = self.seal()
 
     def _drop(self, *names: str) -> None:
@@ -357,13 +357,10 @@ def _connected(path: Path, mode: str, *, timeout: float) -> sqlite3.Connection:
     """
     for end in ("", "-wal", "-shm", "-journal"):
         file = path.with_name(path.name + end)
-        try:
-            mode_of = file.lstat().st_mode
-        except FileNotFoundError:
-            continue  # asked once: another process may begin it meanwhile
-        is_plain = stat.S_ISREG(mode_of) and end != "-journal"
         reason = f"{file.name}, a link, no file, or a journal, which none leaves"
-        whole(path, is_plain, reason)
+        with suppress(FileNotFoundError):  # asked once: another may begin it meanwhile
+            is_plain = stat.S_ISREG(file.lstat().st_mode) and end != "-journal"
+            whole(path, is_plain, reason)
     place = f"file:{quote(str(path.absolute()))}?mode={mode}"
     how: Any = {"isolation_level": None, "check_same_thread": False}
     return sqlite3.connect(place, uri=True, timeout=timeout, **how)

@@ -59,7 +59,7 @@ def test_what_was_not_committed_is_not_there(made, folder):
         with campaign._storage.writing():
             pass
         campaign.tell([0.1, 0.2, 0.3, 0.4])
-        log = (folder / "store.db-wal").read_bytes()
+        log = (folder / "store.db-wal").read_bytes().rstrip(b"\0")
         before = (folder / FILE).read_bytes()
     for num_bytes in (0, 20, 40, len(log) // 2, len(log) - 1):
         (folder / FILE).write_bytes(before)
@@ -176,8 +176,7 @@ def test_a_full_disk_refuses_and_loses_nothing(made, folder):
         campaign = Campaign.load(folder, simulator=MODEL)
         with campaign._storage.writing():
             pass
-        log = (folder / "store.db-wal").stat().st_size
-        resource.setrlimit(resource.RLIMIT_FSIZE, (log + 50, log + 50))
+        resource.setrlimit(resource.RLIMIT_FSIZE, (50, 50))
         try:
             campaign.tell([0.1, 0.2, 0.3, 0.4])
         except OSError as error:

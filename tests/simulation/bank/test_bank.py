@@ -199,6 +199,26 @@ def test_what_is_stored_is_synchronized_with_the_disk(bank):
     assert found == [2, "wal", 0]  # 2: an fsync at each commit
 
 
+def test_the_log_does_not_grow_by_what_is_written(bank):
+    log = bank._store.path.with_name("store.db-wal")
+    rows = simulate(simulator, *draw(10), seed=0)
+    sizes = {append(bank, rows, seed) and log.stat().st_size for seed in range(20)}
+    assert sizes == {2**20}
+    Bank(bank.path).verify()
+    bank.close()
+    assert not log.exists()
+
+
+def test_a_log_that_nothing_was_written_to_is_empty(bank):
+    append(bank, simulate(simulator, *draw(10), seed=0), 0)
+    bank.close()
+    bank._store.path.with_name("store.db-wal").write_bytes(bytes(2**20))
+    assert len(Bank(bank.path)) == 10
+    Bank(bank.path).verify()
+    append(bank, simulate(simulator, *draw(10), seed=1), 1)
+    assert len(Bank(bank.path)) == 20
+
+
 class forked:  # noqa: N801
     """A function in a process of its own, which needs no imports."""
 
