@@ -26,19 +26,8 @@ import torch
 from attrs import evolve
 from torch import Tensor
 
+from benchmarks import rounds
 from benchmarks.numerical.methods import FAITHFUL
-from benchmarks.rounds import (
-    Cells,
-    Rows,
-    active_against_random,
-    by_round,
-    cells_of,
-    coverage_table,
-    drawn_truth,
-    last_round,
-    num_rounds,
-    played,
-)
 from benchmarks.rows import benchmark, column, grouped, published
 from sbi_active import Campaign, CampaignOptions
 from sbi_active.campaign.learning.methods import METHODS
@@ -66,24 +55,24 @@ LARGEST_ERROR = 0.5
 PAIRS = (("asbi", "nsbi"), ("alhi", "nlhi"))  # chosen and random actions
 
 
-def table(rows: Rows) -> str:
+def table(rows: rounds.Rows) -> str:
     """Return the tables of each setting, the paper's figures beside ours."""
     parts: list[str] = []
     for (setting,), found in grouped(rows, "setting").items():
-        cells = cells_of(found)
+        cells = rounds.cells_of(found)
         if setting == "coverage":
-            parts.append(coverage_table(cells, (3,), ("gap", gap)))
+            parts.append(rounds.coverage_table(cells, (3,), ("gap", gap)))
             continue
         parts += [errors_table(cells), rounds_table(cells), time_table(cells)]
-        parts += active_against_random(cells, PAIRS)
+        parts += rounds.active_against_random(cells, PAIRS)
     return "\n\n".join(parts) or "no trials yet"
 
 
-def errors_table(cells: Cells) -> str:
+def errors_table(cells: rounds.Cells) -> str:
     """Return Table 2: the reproduction errors of the last belief."""
     table = []
     for (method, target), rows in cells.items():
-        last = num_rounds(rows)
+        last = rounds.num_rounds(rows)
         published = PUBLISHED.get(f"{method} {target}", ("-",) * len(REPORTED))
         trials = len(column(rows, "log_prob_true", last))
         entry = [f"target {target}", method.upper(), str(trials)]
@@ -98,14 +87,14 @@ def errors_table(cells: Cells) -> str:
     return Table(header, table).text()
 
 
-def rounds_table(cells: Cells) -> str:
+def rounds_table(cells: rounds.Cells) -> str:
     """Return Figures 7 and 8 in numbers, and the gap to the exact posterior."""
     table = []
     for (method, target), rows in cells.items():
-        last = num_rounds(rows)
-        medians = [np.median(v) for v in by_round(rows, "log_prob_true")]
-        speeds = [v.mean() for v in by_round(rows, "speed")]
-        shares = [1 - v.mean() for v in by_round(rows, "is_valid")]
+        last = rounds.num_rounds(rows)
+        medians = [np.median(v) for v in rounds.by_round(rows, "log_prob_true")]
+        speeds = [v.mean() for v in rounds.by_round(rows, "speed")]
+        shares = [1 - v.mean() for v in rounds.by_round(rows, "is_valid")]
         table.append(
             [
                 f"target {target}, {method.upper()}",
@@ -120,7 +109,7 @@ def rounds_table(cells: Cells) -> str:
     return Table([*header, "mean speed", "paper", "share off the table"], table).text()
 
 
-def time_table(cells: Cells) -> str:
+def time_table(cells: rounds.Cells) -> str:
     """Return Figure 9 in numbers: what a round costs."""
     table = []
     for (method, target), rows in cells.items():
@@ -136,7 +125,7 @@ def time_table(cells: Cells) -> str:
     return f"{Table(header, table).text()}\npaper, ASBI: {PUBLISHED_TIME}"
 
 
-def time_parts(rows: Rows, kind: str) -> dict[str, float]:
+def time_parts(rows: rounds.Rows, kind: str) -> dict[str, float]:
     """Return mean seconds a round by part."""
     return {
         part: float(sum(column(rows, f"{kind}_{s}").mean() for s in stages))
@@ -144,7 +133,7 @@ def time_parts(rows: Rows, kind: str) -> dict[str, float]:
     }
 
 
-def gap(rows: Rows, round_: int) -> str:
+def gap(rows: rounds.Rows, round_: int) -> str:
     """Return the gap to the exact posterior: mean, its error, 95th percentile.
 
     Of trials whose reference is known well enough; how many are not is said.
@@ -160,7 +149,7 @@ def gap(rows: Rows, round_: int) -> str:
     return f"{values.mean():.2f} +- {error:.2f}, {percentile:.2f} ({exact:.2f}){lost}"
 
 
-def known(rows: Rows, key: str, round_: int) -> Any:
+def known(rows: rounds.Rows, key: str, round_: int) -> Any:
     """Return the reference's column where its log p is known within .5 nats."""
     values = column(rows, key, round_)
     return values[column(rows, "log_p_exact_se", round_) <= LARGEST_ERROR]
@@ -203,7 +192,7 @@ def rows_of(
     task, num = make_task(target, seed), NUM_ROUNDS[setting]
     rows: list[dict[str, object]] = []
     options = options_of(method, setting)
-    made = played(task, seed, num, method=method, options=options)
+    made = rounds.played(task, seed, num, method=method, options=options)
     for index, (campaign, _) in enumerate(made):
         is_last = index + 1 == num
         row = round_row(task, campaign, is_last=is_last)
@@ -234,7 +223,7 @@ def options_of(method: str, setting: str) -> CampaignOptions:
 def round_row(task: Any, campaign: Campaign, *, is_last: bool) -> dict[str, object]:
     """Return the figures of the last round, without the reference's."""
     trial = campaign.history[-1]
-    row = last_round(campaign, task.theta_true)[0] | {
+    row = rounds.last_round(campaign, task.theta_true)[0] | {
         "speed": float(trial.action),
         "is_valid": int(trial.status == "ok"),
     }
@@ -251,7 +240,7 @@ def make_task(target: str, seed: int) -> Any:
     """Return a target of the paper, or a truth drawn from the prior."""
     if target != "prior":
         return get_task("box_collision", target=int(target))
-    return drawn_truth(get_task("box_collision"), seed)
+    return rounds.drawn_truth(get_task("box_collision"), seed)
 
 
 main = benchmark(

@@ -27,21 +27,10 @@ from typing import Any
 import numpy as np
 import torch
 
-from benchmarks.pouring.campaign import TEMPERED, GridBelief, rounds
+from benchmarks import rounds
+from benchmarks.pouring import campaign
 from benchmarks.pouring.learned import ByAction, learn
 from benchmarks.pouring.network import ByNetwork, learn_networks
-from benchmarks.rounds import (
-    NUM_DRAWS,
-    Cells,
-    Rows,
-    active_against_random,
-    by_round,
-    cells_of,
-    coverage_table,
-    drawn_truth,
-    known_truth,
-    num_rounds,
-)
 from benchmarks.rows import benchmark, column, published
 from sbi_active.display.table import Table
 from sbi_active.seeding import derive_seed, forked_generators
@@ -51,7 +40,7 @@ from sbi_active.tasks import get_task
 PUBLISHED = published("pouring")
 
 
-def summarize(cells: Cells) -> str:
+def summarize(cells: rounds.Cells) -> str:
     """Return all tables, the paper's figures beside ours.
 
     Args:
@@ -59,7 +48,7 @@ def summarize(cells: Cells) -> str:
     """
     log_p, chosen = [], []
     for (method, target), rows in cells.items():
-        log_probs = by_round(rows, "log_prob_true")
+        log_probs = rounds.by_round(rows, "log_prob_true")
         label = f"target {target}, {method.upper()}"
         last = log_probs[-1]
         seconds = sum(
@@ -73,14 +62,14 @@ def summarize(cells: Cells) -> str:
                 " / ".join(f"{np.median(v):.2f}" for v in log_probs),
                 f"{last.min():.2f} .. {last.max():.2f}",
                 *PUBLISHED.get(f"{method} {target}", "-"),
-                f"{by_round(rows, 'power')[-1].mean():.2f}".replace("nan", "-"),
+                f"{rounds.by_round(rows, 'power')[-1].mean():.2f}".replace("nan", "-"),
                 f"{seconds:.0f}",
             ]
         )
-        low = [(v == 20).mean() for v in by_round(rows, "height")]
-        mesh = [v.mean() for v in by_round(rows, "delta")]
-        pairs = zip(by_round(rows, "eig_mesh"), by_round(rows, "eig_pca"), strict=True)
-        common = [np.mean(one - other) for one, other in pairs]
+        low = [(v == 20).mean() for v in rounds.by_round(rows, "height")]
+        mesh = [v.mean() for v in rounds.by_round(rows, "delta")]
+        both = (rounds.by_round(rows, name) for name in ("eig_mesh", "eig_pca"))
+        common = [np.mean(one - other) for one, other in zip(*both, strict=True)]
         chosen.append(
             [
                 label,
@@ -101,7 +90,7 @@ def summarize(cells: Cells) -> str:
         chosen,
     ).text()
     shares = [actions_table(cells[key], key[1]) for key in cells if key[0] == "asbi"]
-    return "\n\n".join([first, second, *shares, *active_against_random(cells)])
+    return "\n\n".join([first, second, *shares, *rounds.active_against_random(cells)])
 
 
 def label(row: Mapping[str, str]) -> str:
@@ -111,21 +100,21 @@ def label(row: Mapping[str, str]) -> str:
     return ", ".join(f"{v:g}" for v in numbers) + f", {summary}"
 
 
-def actions_table(rows: Rows, target: str) -> str:
+def actions_table(rows: rounds.Rows, target: str) -> str:
     """Return the share of trials at each action that was chosen, round by round."""
-    rounds = sorted({int(r["round"]) for r in rows})
+    numbers = sorted({int(r["round"]) for r in rows})
     table = []
     for name in sorted({label(r) for r in rows}):
         share = [
             np.mean([label(r) == name for r in rows if int(r["round"]) == number])
-            for number in rounds
+            for number in numbers
         ]
         table.append([name, " / ".join(f"{v:.1f}" for v in share)])
     head = f"target {target}: h cm, p cm, v rad/s, summary"
     return Table([head, "share of ASBI's trials by round"], table).text()
 
 
-def mean_log_p(rows: Rows, number: int) -> str:
+def mean_log_p(rows: rounds.Rows, number: int) -> str:
     """Return the mean log p(truth) of a round."""
     return f"{column(rows, 'log_prob_true', number).mean():.2f}"
 
@@ -140,17 +129,17 @@ def rows_of(
     """Return one row a round of one campaign."""
     task, learned = make_task(target, seed), known(method in BY_NETWORK, bank)
     rows: list[dict[str, object]] = []
-    for found in rounds(
-        *(task, learned, lambda log_p: GridBelief(torch.from_numpy(log_p))),
-        GridBelief.middles().double().numpy(),
+    for found in campaign.rounds(
+        *(task, learned, lambda log_p: campaign.GridBelief(torch.from_numpy(log_p))),
+        campaign.GridBelief.middles().double().numpy(),
         num=3 if target == "prior" else 6,
         seed=seed,
         is_active=method in ACTIVE,
-        tempered=TEMPERED if isinstance(learned, ByAction) else 0.0,
+        tempered=campaign.TEMPERED if isinstance(learned, ByAction) else 0.0,
     ):
         with forked_generators(derive_seed(seed, "draws", found.index)):
-            draws = found.belief.sample(torch.Size([NUM_DRAWS]))
-        row = found.row() | known_truth(found.belief, task.theta_true, draws)
+            draws = found.belief.sample(torch.Size([rounds.NUM_DRAWS]))
+        row = found.row() | rounds.known_truth(found.belief, task.theta_true, draws)
         row |= {
             "eig_pca": float(found.gain[0].max()),
             "eig_mesh": float(found.gain[1].max()),
@@ -174,17 +163,17 @@ def make_task(target: str, seed: int) -> Any:
     """Return a target of the paper, or a truth drawn from the prior."""
     if target != "prior":
         return get_task("pouring", target=int(target))
-    return drawn_truth(get_task("pouring"), seed)
+    return rounds.drawn_truth(get_task("pouring"), seed)
 
 
-def table(rows: Rows) -> str:
+def table(rows: rounds.Rows) -> str:
     """Return the tables of the paper's targets, or how often regions hold truths."""
-    drawn = cells_of([row for row in rows if row["target"] == "prior"])
-    cells = cells_of([row for row in rows if row["target"] != "prior"])
+    drawn = rounds.cells_of([row for row in rows if row["target"] == "prior"])
+    cells = rounds.cells_of([row for row in rows if row["target"] != "prior"])
     parts = [summarize(cells)] if cells else []
     if drawn:
-        numbers = range(1, 1 + max(map(num_rounds, drawn.values())))
-        parts.append(coverage_table(drawn, numbers, ("mean log p", mean_log_p)))
+        numbers = range(1, 1 + max(map(rounds.num_rounds, drawn.values())))
+        parts.append(rounds.coverage_table(drawn, numbers, ("mean log p", mean_log_p)))
     return "\n\n".join(parts) or "no trials yet"
 
 
