@@ -9,11 +9,9 @@ import torch
 from torch import Tensor
 
 from sbi_active.actions import ActionSpace
-from sbi_active.design.drawing import draw, labels_of
+from sbi_active.design.drawing import draw
 from sbi_active.design.estimators.base import Bound
 from sbi_active.display.figures import legible
-from sbi_active.display.notebook import card, facts, items, table
-from sbi_active.display.table import Table, number
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -101,37 +99,12 @@ class Design:
         error = float(self.standard_error[self.index])
         return f"Design(action [{action}], EIG {gain:.2f} +- {error:.2f} nats)"
 
-    def _repr_html_(self) -> str:
-        gain, error = self.expected_information_gain, self.standard_error
-        best = gain.nan_to_num(nan=-torch.inf).argsort(descending=True, stable=True)
-        rows = [
-            [
-                "chosen" if k == self.index else "",
-                *[f"{v:.4g}" for v in self.candidates[k].tolist()],
-                number(float(gain[k])),
-                number(float(error[k])),
-                number(float(self.probability_best[k])),
-            ]
-            for k in dict.fromkeys([self.index, *best[:5].tolist()])
-        ]
-        ends = ("EIG [nats]", "standard error", "probability best")
-        header = ["", *labels_of(self), *ends]
-        left = len(gain) - len(rows)
-        pairs = [
-            ("estimator", self.estimator if self.estimator != "none" else None),
-            ("side of the estimates", self.bound if self.bound != "none" else None),
-            ("simulations", self.num_simulations or None),
-            ("further candidates", left or None),
-        ]
-        shown = table(Table(header, rows))
-        return card(repr(self), shown, facts(pairs), items(self.notes))
-
     def plot(self, ax: Axes | None = None) -> Axes:
         """Plot the expected information gain of the candidates.
 
         The plot is over one entry of the action with two standard errors, over two as a
-        map with the candidates that were evaluated, and over more as the best of them
-        in order.
+        map with the candidates that were evaluated; of more the candidates stand in
+        order, the best first.
 
         Args:
             ax: Axes to draw on; None makes a figure.

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import torch
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -24,8 +25,8 @@ def draw(design: Any, ax: Axes | None = None) -> Axes:
 
     if ax is None:
         ax = plt.figure(layout="constrained").add_subplot()
-    dim = design.candidates.shape[1]
-    {1: _curve, 2: _map}.get(dim, _bars)(ax, design)
+    drawn = _map if design.candidates.shape[1] == 2 else _curve
+    drawn(ax, design)
     return ax
 
 
@@ -40,16 +41,18 @@ def _gain_label(design: Any) -> str:
 
 
 def _curve(ax: Axes, design: Any) -> None:
-    """Draw the gain over the only entry of the action, with two standard errors."""
-    order = design.candidates[:, 0].argsort()
+    """Draw the gain with two standard errors, over the entry or from the best on."""
     gain, two = design.expected_information_gain, 2 * design.standard_error
-    place = design.candidates[order, 0].numpy()
+    order = gain.nan_to_num(nan=-np.inf).argsort(descending=True, stable=True)
+    place, label = torch.arange(len(order)), "candidates, the best first"
+    if design.candidates.shape[1] == 1:
+        order = design.candidates[:, 0].argsort()
+        place, (label,) = design.candidates[order, 0], labels_of(design)
     style: dict[str, Any] = {"fmt": "o-", "ms": 4, "capsize": 2}
-    ax.errorbar(place, gain[order].numpy(), two[order].numpy(), **style)
-    chosen = float(design.candidates[design.index, 0])
-    ax.axvline(chosen, ls=":", color="k", label="chosen")
+    ax.errorbar(place.numpy(), gain[order].numpy(), two[order].numpy(), **style)
+    ax.axvline(float(place[order == design.index]), ls=":", color="k", label="chosen")
     ax.legend()
-    ax.set(xlabel=labels_of(design)[0], ylabel=_gain_label(design))
+    ax.set(xlabel=label, ylabel=_gain_label(design))
 
 
 def _map(ax: Axes, design: Any) -> None:
@@ -65,28 +68,3 @@ def _map(ax: Axes, design: Any) -> None:
         ax.plot(*action[:, None], "o", zorder=4, label="chosen", **ring)
     first, second = labels_of(design)
     ax.set(xlabel=first, ylabel=second, title="red circle: chosen")
-
-
-def _bars(ax: Axes, design: Any, most: int = 15) -> None:
-    """Draw the best candidates in order, the chosen one among them.
-
-    Labels of more run into each other.
-    """
-    gain = design.expected_information_gain.double().numpy()
-    order = np.argsort(-np.nan_to_num(gain, nan=-np.inf), kind="stable")[:most]
-    if design.index not in order:
-        order = np.append(order[:-1], design.index)
-    order = order[::-1].copy()
-    names = ", ".join(name.partition(" [")[0] for name in labels_of(design))
-    rows = design.candidates[order].numpy()
-    where, two = np.arange(len(order)), 2 * design.standard_error[order].numpy()
-    colors = [CHOSEN if k == design.index else "C0" for k in order]
-    ax.barh(where, np.nan_to_num(gain[order]), color=colors, height=0.7)
-    ax.errorbar(gain[order], where, xerr=two, fmt="none", ecolor="k", capsize=2)
-    ax.set_yticks(where, [", ".join(f"{v:.3g}" for v in row) for row in rows])
-    ax.tick_params(axis="y", labelsize=8)
-    how = "chosen at random" if np.isnan(gain).all() else "red: chosen"
-    left = len(gain) - len(order)
-    ax.set_title(how + (f"; {left} further candidates" if left else ""), fontsize=9)
-    ax.set_xlabel(_gain_label(design))
-    ax.set_ylabel(names, fontsize=8)
