@@ -11,7 +11,7 @@ from torch import Tensor
 from torch.distributions import Distribution
 
 from sbi_active.design.design import Design, action_labels
-from sbi_active.design.estimators.automatic import choose_estimator, disagreements
+from sbi_active.design.estimators.automatic import choose_estimator
 from sbi_active.design.estimators.base import (
     CandidateSimulations,
     InformationGainEstimator,
@@ -301,22 +301,11 @@ class GainEvaluator:
             stopped=stopped,
             notes=(
                 *said,
-                *self._cautions(halves[0], [gains[0][a] for a in active]),
+                *self.estimator.cautions(torch.stack([gains[0][a] for a in active])),
                 *sampler.notes,
                 *notes,
             ),
         )
-
-    def _cautions(
-        self, simulations: CandidateSimulations, gain: list[Tensor]
-    ) -> list[str]:
-        """Return cautions about the contributions of the last candidates."""
-        if self.num_others:
-            return self.estimator.cautions(torch.stack(gain))
-        model = self.model if self.sampler.summaries is None else None
-        given = model, simulations, self.belief
-        with single_thread():
-            return disagreements(self.estimator, *given, torch.stack(gain))
 
 
 def _halves(simulations: CandidateSimulations) -> list[CandidateSimulations]:

@@ -5,14 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-import torch
-from torch import Tensor
 from torch.distributions import Distribution
 
 from sbi_active.design.estimators.base import (
     CandidateSimulations,
     InformationGainEstimator,
-    standard_error,
 )
 from sbi_active.design.estimators.contrast import (
     InfoNCEGain,
@@ -24,7 +21,6 @@ from sbi_active.design.estimators.entropy import EntropyGain, random_presence
 from sbi_active.design.estimators.linear import LinearGain
 from sbi_active.design.estimators.nested import NestedGain
 from sbi_active.design.estimators.posterior import ParameterGain
-from sbi_active.messages import warn
 
 #: Name of an estimator: its class.
 ESTIMATORS: dict[str, type[InformationGainEstimator]] = {
@@ -35,12 +31,6 @@ ESTIMATORS: dict[str, type[InformationGainEstimator]] = {
     "nested": NestedGain,
     "posterior": PosteriorGain,
     "ratio": RatioGain,
-}
-#: Former name of an estimator or a search: the name of the one in its place.
-FORMER = {
-    "bayesopt": "gradient",
-    "contrastive": "info_nce",
-    "variational_nested": "likelihood",
 }
 #: Numbers of x up to which nearest neighbors are trusted.
 MAX_NEIGHBOR_OUTCOMES = 2
@@ -66,7 +56,7 @@ def find_estimator(
 
 
 def by_name(name: str, what: str, known: Mapping[str, type]) -> Any:
-    """Return an object of the class of a name, or of a former one.
+    """Return an object of the class of a name.
 
     Args:
         name: Name that was given.
@@ -76,12 +66,6 @@ def by_name(name: str, what: str, known: Mapping[str, type]) -> Any:
     Raises:
         ValueError: If the name is unknown; it lists the valid ones.
     """
-    if FORMER.get(name) in known:
-        warn(
-            f"SA701 {what}={name!r} goes in the next version: use "
-            f'{what}="{FORMER[name]}", or "auto"',
-        )
-        name = FORMER[name]
     if name not in known:
         raise ValueError(
             f"expected {what} among 'auto', {', '.join(map(repr, known))}; got "
@@ -150,44 +134,3 @@ def choose_estimator(
     if bool(random_presence(simulations).any()):
         return ParameterGain(), notes
     return by_noise, [*notes, "used all the same: there is no model"]
-
-
-def disagreements(
-    estimator: InformationGainEstimator,
-    model: Any,
-    simulations: CandidateSimulations,
-    belief: Distribution | None,
-    gain: Tensor,
-    *,
-    negligible: float = 0.3,
-) -> list[str]:
-    """Return cautions about an estimate, which is compared with a bound.
-
-    That is the network's of an estimate without a bound, and InfoNCE of a ratio. There
-    is a sentence for a disagreement, by the contributions (a, n): four standard errors
-    beyond ``negligible`` nats.
-    """
-    notes, other = estimator.cautions(gain), None
-    # A model that is trained on demand is not trained for a note.
-    at_hand = estimator.bound == "none" and getattr(model, "is_trained", True)
-    if at_hand and hasattr(model, "log_posterior"):
-        other = PosteriorGain()
-    if isinstance(estimator, RatioGain):
-        other = InfoNCEGain()
-    if other is None:
-        return notes
-    estimate = other(model, simulations, belief)
-    difference = estimate - gain
-    error = torch.stack([standard_error(row) for row in difference])
-    mean = difference.nanmean(1)
-    apart = (mean.abs() > negligible + 4 * error) & (not other.cautions(estimate))
-    if bool(apart.any()):
-        worst = int(torch.where(apart, mean.abs(), 0.0).argmax())
-        side = "below" if float(mean[worst]) < 0 else "above"
-        blunt = " (a lower bound: the network is blunt)" if side == "below" else ""
-        notes.append(
-            f"{type(other).__name__} is {abs(float(mean[worst])):.1f} nats {side} at "
-            f"action {simulations.action[worst].tolist()}, apart at "
-            f"{int(apart.sum())} of {len(apart)}{blunt}"
-        )
-    return notes
