@@ -21,7 +21,7 @@ from sbi_active.design.estimators.entropy import (
     conditional_entropy,
     presence_information,
     presence_notes,
-    presence_problems,
+    problems_of_noise,
     with_control,
 )
 from sbi_active.design.estimators.evidence import Evidence
@@ -148,21 +148,16 @@ class NestedGain(InformationGainEstimator):
             few: Complete outcomes that are too few for an emulator; five pairs for each
                 number of x are needed to estimate its noise.
         """
-        needed = few
-        if simulations.noise is None:
-            needed = max(few, 5 * simulations.x[0, 0].numel())
-        if int(simulations.complete.sum(1).max()) < needed:
-            return [f"fewer than {needed} complete outcomes a candidate"]
-        if simulations.noise is None:
-            problems = EntropyGain().problems(simulations)
-            missed = learned(simulations).emulator.error.square().mean(0) > 1
-            share = float(missed.double().mean())
-            if share > 0.5:
-                problems.append(f"smoothing misses {share:.0%} of the numbers of x")
+        declared, numbers = simulations.noise is not None, simulations.x[0, 0].numel()
+        needed = few if declared else max(few, 5 * numbers)
+        problems = problems_of_noise(simulations, few=needed)
+        if numbers > 1:  # of one it is .2 nat too high at most
+            problems += EntropyGain().steps(simulations)
+        if declared or problems:
             return problems
-        is_one = simulations.x[0, 0].numel() == 1  # then .2 nat too high at most
-        steps = [] if is_one else EntropyGain().steps(simulations)
-        return presence_problems(simulations) + steps
+        missed = learned(simulations).emulator.error.square().mean(0) > 1
+        share = float(missed.double().mean())
+        return [f"smoothing misses {share:.0%} of the numbers of x"] * (share > 0.5)
 
     @override
     def needs_slopes(
