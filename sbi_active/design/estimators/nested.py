@@ -40,10 +40,9 @@ class NestedGain(InformationGainEstimator):
 
     The m = n - 1 other simulations are draws of the belief b with their exact
     noise-free outcomes. Where fewer than 50 of them are effective, l draws of a
-    Student-t :math:`t_i` around the linearized posterior given :math:`x_i` join, every
-    fourth of them close to :math:`\theta_i` instead, where the outcome is known. Their
-    outcomes come from a :class:`.MeanEmulator` of
-    the noise-free outcomes of all simulations, so no further ones are run.
+    Student-t :math:`t_i` around the linearized posterior given :math:`x_i` join. Their
+    outcomes come from a :class:`.MeanEmulator` of the noise-free outcomes of all
+    simulations, so no further ones are run.
 
     Jensen's bias, half the relative variance of :math:`\hat p`, is subtracted. The
     estimate is too large where the posterior has modes that neither the simulations
