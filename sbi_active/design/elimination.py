@@ -245,7 +245,8 @@ class GainEvaluator:
             each = (budget - sampler.num_drawn) // (num_candidates + self.num_others)
             return min(num, each // 4 * 4)
 
-        size = affordable(max(8, int(share * num_samples)) // 4 * 4, num_actions)
+        # Slopes that a search had may have spent what was the finalists'.
+        size = max(8, affordable(int(share * num_samples) // 4 * 4, num_actions))
         first = self.draw(size, action, halves=True)
         said = [*(self.notes or ()), *self.estimator.remarks(first)]
         halves = _halves(first)

@@ -114,7 +114,7 @@ class Evidence:
         """
         x = self.x[i]
         location, precision = self._linearized(x, slope, i)
-        factor = self.wider * torch.linalg.cholesky(torch.linalg.inv(precision))
+        factor = self.wider * torch.linalg.inv(torch.linalg.cholesky(precision)).mT
         (n, d), num_local = location.shape, self.num_local
         ratio = math.log(num_local / (len(self.knots) - 1))
         step = _student((n, num_local, d), self.degrees) @ factor.mT
@@ -224,7 +224,7 @@ def _student(shape: tuple[int, ...], degrees: int) -> Tensor:
 
 
 def _log_student(offset: Tensor, factor: Tensor, degrees: int) -> Tensor:
-    """Log density at offsets (n, k, d) with lower factors (n, d, d)."""
+    """Log density at offsets (n, k, d) with triangular factors (n, d, d)."""
     square = (offset @ torch.linalg.inv(factor).mT).square().sum(-1)
     log_volume = factor.diagonal(dim1=-2, dim2=-1).log().sum(-1, keepdim=True)
     known = square.numpy(), log_volume.numpy(), offset.shape[-1], degrees
