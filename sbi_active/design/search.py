@@ -265,7 +265,7 @@ class GradientSearch(Search):
 
 
 def ascended(
-    score: Score, start: Tensor, objective: Objective, *, num_steps: int = 40
+    score: Score, start: Tensor, objective: Objective, *, num_steps: int = 24
 ) -> Tensor:
     """Return points that rose from permitted starts (s, dim), shape (s, dim).
 

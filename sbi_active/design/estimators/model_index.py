@@ -229,8 +229,8 @@ class ModelIndexGain(InformationGainEstimator):
             log_prior = log_p + share.log()
             members = class_members(x[train], own[train], enough)
             if len(noise) == 2:
-                known = [part[train] for part in noise]
-                members += noise_members(*known, own[train], enough)
+                center, width = (part[train] for part in noise)
+                members += noise_members(center, width, own[train], enough)
             scores = []
             for member in members:
                 log_f = member(x[test])
