@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import torch
@@ -285,6 +286,9 @@ class GainEvaluator:
                 half.candidates(keep).join(new)
                 for half, new in zip(halves, _halves(drawn), strict=True)
             ]
+        given = self.model, halves[0], self.belief
+        compared = partial(self.estimator.compared, *given)
+        caution = self.estimator.cautions if self.num_others else compared
         return choose(
             limits,
             action=action,
@@ -302,7 +306,7 @@ class GainEvaluator:
             stopped=stopped,
             notes=(
                 *said,
-                *self.estimator.cautions(torch.stack([gains[0][a] for a in active])),
+                *caution(torch.stack([gains[0][a] for a in active])),
                 *sampler.notes,
                 *notes,
             ),

@@ -12,7 +12,7 @@ from sbi_active import (
     MixedActions,
     SimulatorModel,
 )
-from sbi_active.design import Search
+from sbi_active.design import GradientSearch, Search
 from sbi_active.tasks.numerical.task import NumericalTask
 from tests.design.test_designer import Exact
 from tests.linear_gaussian import PRIOR, ExactModel, simulator
@@ -45,6 +45,9 @@ def test_which_search():
     design = designer.select(None, model, belief=PRIOR, seed=0)
     assert design.candidates.shape == (4, 2)
     assert float(design.action[0]) == 2.0
+    with pytest.warns(DeprecationWarning, match='use search="gradient"'):
+        designer = InformationGainDesigner(BOX, search="bayesopt")
+    assert isinstance(designer.search, GradientSearch)
     for search, space, error in (
         ("grid", BOX, "expected search among 'auto', 'gradient'"),
     ):

@@ -21,6 +21,7 @@ from sbi_active.design.estimators.entropy import EntropyGain, random_presence
 from sbi_active.design.estimators.linear import LinearGain
 from sbi_active.design.estimators.nested import NestedGain
 from sbi_active.design.estimators.posterior import ParameterGain
+from sbi_active.messages import warn
 
 #: Name of an estimator: its class.
 ESTIMATORS: dict[str, type[InformationGainEstimator]] = {
@@ -31,6 +32,12 @@ ESTIMATORS: dict[str, type[InformationGainEstimator]] = {
     "nested": NestedGain,
     "posterior": PosteriorGain,
     "ratio": RatioGain,
+}
+#: Former name of an estimator or a search: the name of the one in its place.
+FORMER = {
+    "bayesopt": "gradient",
+    "contrastive": "info_nce",
+    "variational_nested": "likelihood",
 }
 #: Numbers of x up to which nearest neighbors are trusted.
 MAX_NEIGHBOR_OUTCOMES = 2
@@ -54,7 +61,7 @@ def find_estimator(
 
 
 def by_name(given: Any, what: str, kind: type, known: Mapping[str, type]) -> Any:
-    """Return an object of the class of a name; None for "auto".
+    """Return an object of the class of a name, or of a former one; None for "auto".
 
     Args:
         given: Name, or an object.
@@ -67,6 +74,10 @@ def by_name(given: Any, what: str, kind: type, known: Mapping[str, type]) -> Any
     """
     if given == "auto" or isinstance(given, kind):
         return None if given == "auto" else given
+    if FORMER.get(given) in known:
+        now = FORMER[given]
+        warn(f'SA701 {what}={given!r} goes in the next version: use {what}="{now}"')
+        given = now
     if given not in known:
         raise ValueError(
             f"expected {what} among 'auto', {', '.join(map(repr, known))}; got "

@@ -9,7 +9,7 @@ from torch.distributions import Distribution
 
 from sbi_active import DiscreteActions, InformationGainDesigner, SimulatorModel
 from sbi_active.design import LikelihoodGain, LinearGain, PosteriorGain, RatioGain
-from sbi_active.design.estimators.automatic import choose_estimator
+from sbi_active.design.estimators.automatic import choose_estimator, find_estimator
 from sbi_active.design.estimators.base import CandidateSimulations
 from sbi_active.design.estimators.contrast import InfoNCEGain
 from sbi_active.simulation import GaussianNoise
@@ -100,6 +100,28 @@ def test_an_estimate_near_its_limit_is_said_to_be(estimator, text):
     assert float(wrong[0]) < 0.2
     gain = estimator(model, near, PRIOR)
     assert estimator.cautions(gain) == []
+
+
+def test_a_ratio_whose_normalization_is_off_is_noticed():
+    simulations = rows()
+    for offset, expected in ((0.0, 0), (1.0, 1)):
+        given = ExactRatio(offset=offset), simulations, PRIOR
+        notes = RatioGain().compared(*given, RatioGain()(*given))
+        assert len(notes) == expected
+    assert notes[0].startswith("InfoNCEGain is ")
+    assert "nats below" in notes[0]
+
+
+@pytest.mark.parametrize(
+    ("former", "name", "kind"),
+    [
+        ("variational_nested", "likelihood", LikelihoodGain),
+        ("contrastive", "info_nce", InfoNCEGain),
+    ],
+)
+def test_a_former_name_is_taken_for_one_version(former, name, kind):
+    with pytest.warns(DeprecationWarning, match=f'use estimator="{name}"'):
+        assert type(find_estimator(former)) is kind
 
 
 def test_outcomes_on_a_hundred_steps_are_left_to_nested_monte_carlo() -> None:
