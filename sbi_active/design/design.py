@@ -5,18 +5,19 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from sbi_active.actions import ActionSpace
-from sbi_active.design.drawing import draw, labels_of
 from sbi_active.design.estimators.base import Bound
 from sbi_active.display.figures import legible
-from sbi_active.display.notebook import card, facts, items, table
-from sbi_active.display.table import Table, number
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+
+CHOSEN = "#c1432e"
+NOTES = {"lower": " (lower bound)", "upper": " (upper bound)", "none": ""}
 
 
 @dataclass(frozen=True)
@@ -101,37 +102,12 @@ class Design:
         error = float(self.standard_error[self.index])
         return f"Design(action [{action}], EIG {gain:.2f} +- {error:.2f} nats)"
 
-    def _repr_html_(self) -> str:
-        gain, error = self.expected_information_gain, self.standard_error
-        best = gain.nan_to_num(nan=-torch.inf).argsort(descending=True, stable=True)
-        rows = [
-            [
-                "chosen" if k == self.index else "",
-                *[f"{v:.4g}" for v in self.candidates[k].tolist()],
-                number(float(gain[k])),
-                number(float(error[k])),
-                number(float(self.probability_best[k])),
-            ]
-            for k in dict.fromkeys([self.index, *best[:5].tolist()])
-        ]
-        ends = ("EIG [nats]", "standard error", "probability best")
-        header = ["", *labels_of(self), *ends]
-        left = len(gain) - len(rows)
-        pairs = [
-            ("estimator", self.estimator if self.estimator != "none" else None),
-            ("side of the estimates", self.bound if self.bound != "none" else None),
-            ("simulations", self.num_simulations or None),
-            ("further candidates", left or None),
-        ]
-        shown = table(Table(header, rows))
-        return card(repr(self), shown, facts(pairs), items(self.notes))
-
     def plot(self, ax: Axes | None = None) -> Axes:
         """Plot the expected information gain of the candidates.
 
         The plot is over one entry of the action with two standard errors, over two as a
-        map with the candidates that were evaluated, and over more as the best of them
-        in order.
+        map with the candidates that were evaluated; of more the candidates stand in
+        order, the best first.
 
         Args:
             ax: Axes to draw on; None makes a figure.
@@ -156,3 +132,59 @@ def equal_errors(error: Tensor) -> dict[str, Any]:
     """
     kinds = ("standard_error", "difference_standard_error", "probability_best")
     return dict.fromkeys(kinds, error)
+
+
+def draw(design: Design, ax: Axes | None = None) -> Axes:
+    """Draw a design, see :meth:`.Design.plot`.
+
+    Args:
+        design: The design.
+        ax: Axes to draw on; None makes a figure.
+    """
+    import matplotlib.pyplot as plt
+
+    if ax is None:
+        ax = plt.figure(layout="constrained").add_subplot()
+    drawn = _map if design.candidates.shape[1] == 2 else _curve
+    drawn(ax, design)
+    return ax
+
+
+def _labels(design: Design) -> list[str]:
+    """Return names of the entries of the action, with units where known."""
+    dim = design.candidates.shape[1]
+    return [*design.labels] or [f"action {j + 1}" for j in range(dim)]
+
+
+def _gain_label(design: Design) -> str:
+    return f"EIG{NOTES[design.bound]} [nats]"
+
+
+def _curve(ax: Axes, design: Design) -> None:
+    """Draw the gain with two standard errors, over the entry or from the best on."""
+    gain, two = design.expected_information_gain, 2 * design.standard_error
+    order = gain.nan_to_num(nan=-np.inf).argsort(descending=True, stable=True)
+    place, label = torch.arange(len(order)), "candidates, the best first"
+    if design.candidates.shape[1] == 1:
+        order = design.candidates[:, 0].argsort()
+        place, (label,) = design.candidates[order, 0], _labels(design)
+    style: dict[str, Any] = {"fmt": "o-", "ms": 4, "capsize": 2}
+    ax.errorbar(place.numpy(), gain[order].numpy(), two[order].numpy(), **style)
+    ax.axvline(float(place[order == design.index]), ls=":", color="k", label="chosen")
+    ax.legend()
+    ax.set(xlabel=label, ylabel=_gain_label(design))
+
+
+def _map(ax: Axes, design: Design) -> None:
+    """Draw the gain over two entries as colors, the chosen action in a ring."""
+    style: dict[str, Any] = {"s": 26, "lw": 0.6, "edgecolors": "w", "zorder": 3}
+    gain = design.expected_information_gain.numpy()
+    marks = ax.scatter(*design.candidates.double().T.numpy(), c=gain, **style)
+    if np.isfinite(gain).any():
+        figure: Any = ax.figure
+        figure.colorbar(marks, ax=ax).set_label(_gain_label(design))
+    ring: dict[str, Any] = {"ms": 13, "mfc": "none", "mec": CHOSEN, "mew": 2}
+    for action in np.atleast_2d(design.action.numpy()):
+        ax.plot(*action[:, None], "o", zorder=4, label="chosen", **ring)
+    first, second = _labels(design)
+    ax.set(xlabel=first, ylabel=second, title="red circle: chosen")

@@ -27,9 +27,6 @@ from sbi_active.seeding import derive_seed
 from sbi_active.simulation import MissingRowsWarning, Simulations
 from sbi_active.simulation.workers.settings import IN_PROCESS, Workers
 
-#: Name of a search: its class.
-SEARCHES: dict[str, type[Search]] = {"gradient": GradientSearch}
-
 
 class InformationGainDesigner(Shown):
     r"""Choose :math:`\xi^* = \arg\max_\xi I(\theta; x | \xi) / c(\xi)`.
@@ -100,11 +97,8 @@ class InformationGainDesigner(Shown):
         self.num_samples = at_least(num_samples, 8, "num_samples", 1_000)
         self.actions = actions = action_space(actions)
         self.estimator, self.eliminate = estimator, eliminate
-        if isinstance(search, Search):
-            self.search = search
-        else:
-            name = "gradient" if search == "auto" else search
-            self.search: Search = by_name(name, "search", SEARCHES)
+        found = by_name(search, "search", Search, {"gradient": GradientSearch})
+        self.search: Search = found or GradientSearch()
         if actions.listed() is None:
             self.search.size(actions)  # parts that it does not search are an error
         self.workers, self.most_numbers = workers, most_numbers

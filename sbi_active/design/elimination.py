@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import torch
@@ -11,7 +12,7 @@ from torch import Tensor
 from torch.distributions import Distribution
 
 from sbi_active.design.design import Design, action_labels
-from sbi_active.design.estimators.automatic import choose_estimator, disagreements
+from sbi_active.design.estimators.automatic import choose_estimator
 from sbi_active.design.estimators.base import (
     CandidateSimulations,
     InformationGainEstimator,
@@ -245,7 +246,8 @@ class GainEvaluator:
             each = (budget - sampler.num_drawn) // (num_candidates + self.num_others)
             return min(num, each // 4 * 4)
 
-        size = affordable(max(8, int(share * num_samples)) // 4 * 4, num_actions)
+        # Slopes that a search had may have spent what was the finalists'.
+        size = max(8, affordable(int(share * num_samples) // 4 * 4, num_actions))
         first = self.draw(size, action, halves=True)
         said = [*(self.notes or ()), *self.estimator.remarks(first)]
         halves = _halves(first)
@@ -284,6 +286,9 @@ class GainEvaluator:
                 half.candidates(keep).join(new)
                 for half, new in zip(halves, _halves(drawn), strict=True)
             ]
+        given = self.model, halves[0], self.belief
+        compared = partial(self.estimator.compared, *given)
+        caution = self.estimator.cautions if self.num_others else compared
         return choose(
             limits,
             action=action,
@@ -301,22 +306,11 @@ class GainEvaluator:
             stopped=stopped,
             notes=(
                 *said,
-                *self._cautions(halves[0], [gains[0][a] for a in active]),
+                *caution(torch.stack([gains[0][a] for a in active])),
                 *sampler.notes,
                 *notes,
             ),
         )
-
-    def _cautions(
-        self, simulations: CandidateSimulations, gain: list[Tensor]
-    ) -> list[str]:
-        """Return cautions about the contributions of the last candidates."""
-        if self.num_others:
-            return self.estimator.cautions(torch.stack(gain))
-        model = self.model if self.sampler.summaries is None else None
-        given = model, simulations, self.belief
-        with single_thread():
-            return disagreements(self.estimator, *given, torch.stack(gain))
 
 
 def _halves(simulations: CandidateSimulations) -> list[CandidateSimulations]:

@@ -62,10 +62,9 @@ class DesignLimits:
     @property
     def price(self) -> Callable[[Tensor], Tensor] | None:
         """Cost of actions (n, action_dim) after the one before; None for none."""
-        return self._price_after if self.is_sequential else self._price
-
-    def _price_after(self, action: Tensor) -> Any:
-        return self._price(action, self.previous)
+        if not self.is_sequential:
+            return self._price
+        return lambda action: self._price(action, self.previous)
 
     def __call__(self, action: Tensor) -> Tensor:
         """Return a mask of permitted actions (n, action_dim), shape (n,), bool."""

@@ -88,11 +88,6 @@ class JointLikelihood:
     def __init__(self, model: Any, action_dim: int) -> None:
         self.model, self.action_dim = model, action_dim
 
-    @property
-    def exact_likelihood(self) -> bool:
-        """Whether the likelihood of one outcome is exact."""
-        return getattr(self.model, "exact_likelihood", False)
-
     def log_likelihood(self, x: Tensor, theta: Tensor, action: Tensor) -> Tensor:
         """Return log densities, shape (n,), of x (n, k, *x_shape), action (n, k d)."""
         actions = action.split(self.action_dim, 1)

@@ -79,13 +79,12 @@ class CandidateSampler:
     def draw(self, num_samples: int, action: Tensor) -> CandidateSimulations:
         """Simulate candidates (a, action_dim) at fresh parameters, the same for all."""
         self._num_waves += 1
-        paired = self.replicates and not self.declared
-        num = num_samples // 2 if paired else num_samples
+        num = num_samples // 2 if self._is_paired else num_samples
         with forked_generators(self.seed, "theta", self._num_waves):
             theta = self.belief.sample((num,))
-        drawn = self._draw(theta, action, paired, "")
+        drawn = self._draw(theta, action, "")
         if drawn is not None and len(self.others):
-            beside = self._draw(theta, self.others, paired, "others")
+            beside = self._draw(theta, self.others, "others")
             drawn = None if beside is None else join_outcomes(drawn, beside)
         if drawn is None:  # what is declared as noise-free is not
             self.declared, self.summaries = False, None
@@ -131,34 +130,37 @@ class CandidateSampler:
         short = self.summaries
         return [] if short is None else [short.note(self._num_numbers)]
 
+    @property
+    def _is_paired(self) -> bool:
+        return self.replicates and not self.declared
+
     def rewind(self) -> None:
         """Repeat the parameters and the noise of the first draw in the next."""
         self._num_waves = 0
 
     def _draw(
-        self, theta: Tensor, action: Tensor, paired: bool, label: str
+        self, theta: Tensor, action: Tensor, label: str
     ) -> CandidateSimulations | None:
         """Simulate actions (a, action_dim) at parameters (n, theta_dim).
 
-        Twice where paired; None if the declared mean turns out to change from run to
+        Twice in pairs; None if the declared mean turns out to change from run to
         run. The label is the seeds': outcomes that are joined have noise of their own.
         """
         if self.declared:
             return self._draw_declared(theta, action, label)
         x, missing = self._run(self.simulator, theta, action, label + "x")
         again = None
-        if paired:
+        if self._is_paired:
             again, lost = self._run(self.simulator, theta, action, label + "again")
             missing |= lost
-        return CandidateSimulations(
-            theta, action, x, replicate=again, missing=_if_any(missing)
-        )
+        return CandidateSimulations(theta, action, x, replicate=again, missing=missing)
 
     def _draw_declared(
         self, theta: Tensor, action: Tensor, label: str
     ) -> CandidateSimulations | None:
         mean, missing = self._means(theta, action, label + "x")
-        if self._num_waves == 1 and self._lost_by_luck(theta, action, mean):
+        measured = mean.flatten(2).isfinite() | missing[..., None]
+        if self._num_waves == 1 and self._lost_by_luck(theta, action, measured):
             return None
         assert isinstance(self.simulator, SimulatorModel)
         short = self.summaries
@@ -170,7 +172,6 @@ class CandidateSampler:
         else:  # the same noise for all candidates
             seeds = row_seeds(seed, len(theta)).repeat(len(action))
         x = noise.sample(mean.flatten(0, 1), seeds).float().reshape(mean.shape)
-        missing = _if_any(missing)
         return CandidateSimulations(theta, action, x, mean, noise, missing=missing)
 
     def _means(
@@ -199,19 +200,25 @@ class CandidateSampler:
         """Return outcomes (a, n, *x_shape) and which are missing (a, n)."""
         rows = theta.repeat(len(action), 1), action.repeat_interleave(len(theta), 0)
         drawn = self._simulate(simulator, rows, key, self._num_waves)
-        self._count(drawn)
+        self.num_drawn += len(drawn)
+        self.num_missing += drawn.counts["missing"]
         shape = (len(action), len(theta))
         x = drawn.x.reshape(*shape, *drawn.x.shape[1:])
         return x, (drawn.status == Outcome.MISSING).reshape(shape)
 
     def _lost_by_luck(
-        self, theta: Tensor, action: Tensor, mean: Tensor, most: int = 64
+        self, theta: Tensor, action: Tensor, present: Tensor, most: int = 64
     ) -> bool:
-        """Simulate some rows without a measurement again: is there one this time.
+        """Simulate some rows that lack numbers again: are there any this time.
 
         Then presence is random given the parameters, and only replicates tell how much.
+
+        Args:
+            theta: Parameters, shape (n, theta_dim).
+            action: Actions, shape (a, action_dim).
+            present: Mask of the numbers that there are, shape (a, n, q).
+            most: Number of rows to simulate again.
         """
-        present = mean.flatten(2).isfinite()
         a, i = torch.nonzero(~present.all(2), as_tuple=True)
         if len(a) == 0:
             return False
@@ -219,7 +226,7 @@ class CandidateSampler:
         a, i = a[some], i[some]
         assert isinstance(self.simulator, SimulatorModel)
         again = self._simulate(self.simulator.mean, (theta[i], action[a]), "retry")
-        self._count(again)
+        self.num_drawn += len(again)
         known = again.status != Outcome.MISSING
         measured = again.x.flatten(1).isfinite()
         if self.summaries is not None:
@@ -252,10 +259,6 @@ class CandidateSampler:
             seed = derive_seed(self.seed, *key)
             return simulate(simulator, *rows, seed=seed, workers=self.workers)
 
-    def _count(self, drawn: Simulations) -> None:
-        self.num_drawn += len(drawn)
-        self.num_missing += drawn.counts["missing"]
-
 
 @dataclass(frozen=True)
 class _Reproducible:
@@ -266,7 +269,3 @@ class _Reproducible:
     def __call__(self, theta: Tensor, action: Tensor) -> Tensor:
         same = self.model.is_deterministic(theta, action)
         return torch.full((len(theta), 1), float(same))
-
-
-def _if_any(missing: Tensor) -> Tensor | None:
-    return missing if bool(missing.any()) else None

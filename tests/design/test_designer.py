@@ -105,20 +105,6 @@ def test_a_mean_that_changes_from_run_to_run_is_a_draw():
     assert (distance < 4 * design.standard_error + 0.1).all()
 
 
-def test_a_blunt_network_is_said_to_be_blunt():
-    class Blunt(ExactModel):
-        def log_posterior(self, theta, x, action):
-            return PRIOR.log_prob(theta)
-
-    model = SimulatorModel(declared, noise=GaussianNoise(1.0))
-    design = InformationGainDesigner(ACTIONS).select(Blunt(), model, seed=0)
-    assert design.action.tolist() == [2.0]
-    (note,) = design.notes
-    assert note.startswith("PosteriorGain is 1.")
-    assert "nats below at action [2.0]" in note
-    assert "the network is blunt" in note
-
-
 def test_leading_actions_get_more_simulations():
     values = torch.tensor([0.0, 0.01, 3.0, 3.3, 3.6])
     designer = InformationGainDesigner(

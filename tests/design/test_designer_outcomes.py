@@ -1,9 +1,16 @@
 """Designs on simulators whose outcomes are invalid or missing."""
 
+import warnings
+
 import pytest
 import torch
 
-from sbi_active import DiscreteActions, InformationGainDesigner
+from sbi_active import (
+    DiscreteActions,
+    GaussianNoise,
+    InformationGainDesigner,
+    SimulatorModel,
+)
 from sbi_active.seeding import row_normals
 from sbi_active.simulation import MissingRowsWarning
 from tests.design.test_designer import ACTIONS, VALUES
@@ -62,3 +69,28 @@ def test_missing_rows_are_counted_and_warned_of_once():
     assert len([w for w in caught if w.category is MissingRowsWarning]) == 1
     error = (0.04 / design.num_simulations) ** 0.5
     assert abs(design.num_missing / design.num_simulations - 0.04) < 3 * error
+
+
+@pytest.mark.parametrize("declared", [True, False])
+def test_a_rare_fault_stops_no_design(declared):
+    """Rows were lost in one draw and not in the next, or all that were run again."""
+
+    def fails(theta, action):
+        if bool((theta > 2.5).any()):
+            raise RuntimeError("diverged")
+        return theta * action
+
+    def noisy(theta, action):
+        return fails(theta, action) + torch.randn_like(theta)
+
+    model = SimulatorModel(fails, noise=GaussianNoise(1.0)) if declared else noisy
+    belief = torch.distributions.MultivariateNormal(torch.zeros(1), torch.eye(1))
+    designer = InformationGainDesigner(DiscreteActions([1.0, 1.1]), num_samples=400)
+    lost = []
+    for seed in range(3):
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", MissingRowsWarning)
+            design = designer.select(None, model, belief=belief, seed=seed)
+        assert design.probability_valid.tolist() == [1.0, 1.0]
+        lost.append(design.num_missing)
+    assert 0 < max(lost) < 60

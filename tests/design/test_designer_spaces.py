@@ -2,6 +2,7 @@
 
 import pytest
 import torch
+from torch.distributions import MultivariateNormal
 
 from sbi_active import (
     BoxActions,
@@ -82,3 +83,17 @@ def test_evaluations_share_parameters_and_noise_from_call_to_call():
     # what compares and reports is fresh
     assert not torch.equal(first.utility, design.expected_information_gain)
     assert design.num_simulations == int(design.num_samples.sum()) + 4 * 16
+
+
+def test_slopes_in_a_search_leave_its_finalists_simulations():
+    prior = MultivariateNormal(torch.zeros(4), torch.eye(4))
+    weight = torch.randn(4, 9, generator=torch.Generator().manual_seed(0))
+
+    def swing(theta, action):
+        return 2 * torch.sin(3 * action[:, :1] * (theta @ weight))
+
+    model = SimulatorModel(swing, noise=GaussianNoise(0.05))
+    designer = InformationGainDesigner(BOX, num_samples=64, estimator="nested")
+    design = designer.select(None, model, belief=prior, seed=0)
+    assert design.expected_information_gain.isfinite().all()
+    assert int(design.num_samples.min()) >= 8

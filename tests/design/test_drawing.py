@@ -61,3 +61,13 @@ def test_two_entries_make_a_map_with_every_candidate_and_the_chosen_one():
     np.testing.assert_allclose(chosen.get_xydata()[0], made.action)
     assert (ax.get_xlabel(), ax.get_ylabel()) == ("speed [m/s]", "tilt")
     assert [a.get_ylabel() for a in ax.figure.axes][1:] == ["EIG (lower bound) [nats]"]
+
+
+def test_more_entries_make_candidates_in_order() -> None:
+    made = design(BoxActions([0.0] * 3, [1.0] * 3))
+    ax = made.plot()
+    gain = made.expected_information_gain.sort(descending=True).values
+    np.testing.assert_allclose(ax.lines[0].get_ydata(), gain)
+    (chosen,) = [each for each in ax.lines if each.get_label() == "chosen"]
+    place = int(chosen.get_xdata()[0])
+    assert float(gain[place]) == float(made.expected_information_gain[made.index])

@@ -13,7 +13,6 @@ from sbi_active import (
     Campaign,
     DiscreteActions,
     GaussianNoise,
-    RandomDesigner,
     SimulatorModel,
 )
 from sbi_active.campaign.display.page import page as campaign_page
@@ -133,16 +132,6 @@ def test_a_campaign_has_its_health_belief_and_trials(campaign):
     before = torch.get_rng_state()
     campaign.belief._repr_html_()
     assert torch.equal(torch.get_rng_state(), before)
-
-
-def test_a_design_has_the_chosen_and_the_best_candidates(campaign):
-    design = campaign.pending.design
-    page = page_of(design)
-    assert page.texts.count("chosen") == 1
-    assert f"{float(design.expected_information_gain[design.index]):.3g}" in page.texts
-    pairs = DiscreteActions([[0.0, 1.0], [1.0, 2.0]], names=["a", "b"])
-    page = page_of(RandomDesigner(pairs).select(seed=0))
-    assert {"a", "b", "chosen"} <= {*page.texts}
 
 
 def test_pieces_are_escaped():

@@ -9,8 +9,7 @@ import torch
 from torch import Tensor
 
 from sbi_active.arrays import Array
-from sbi_active.design.design import action_labels
-from sbi_active.design.drawing import draw
+from sbi_active.design.design import action_labels, draw
 from sbi_active.display.table import within
 from sbi_active.seeding import derive_seed, forked_generators
 

@@ -125,11 +125,6 @@ class RoundModel:
     def __init__(self, trained: Callable[[], Any] | None) -> None:
         self._trained, self._model = trained, None
 
-    @property
-    def is_trained(self) -> bool:
-        """Whether the model is there without any work."""
-        return self._model is not None
-
     def train(self) -> None:
         """Train the model, unless that has been done."""
         if self._model is None and self._trained is not None:

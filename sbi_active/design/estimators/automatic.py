@@ -5,14 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-import torch
-from torch import Tensor
 from torch.distributions import Distribution
 
 from sbi_active.design.estimators.base import (
     CandidateSimulations,
     InformationGainEstimator,
-    standard_error,
 )
 from sbi_active.design.estimators.contrast import (
     InfoNCEGain,
@@ -60,34 +57,33 @@ def find_estimator(
     Raises:
         ValueError: If the name is unknown; it lists the valid ones.
     """
-    if isinstance(estimator, InformationGainEstimator):
-        return estimator
-    return None if estimator == "auto" else by_name(estimator, "estimator", ESTIMATORS)
+    return by_name(estimator, "estimator", InformationGainEstimator, ESTIMATORS)
 
 
-def by_name(name: str, what: str, known: Mapping[str, type]) -> Any:
-    """Return an object of the class of a name, or of a former one.
+def by_name(given: Any, what: str, kind: type, known: Mapping[str, type]) -> Any:
+    """Return an object of the class of a name, or of a former one; None for "auto".
 
     Args:
-        name: Name that was given.
+        given: Name, or an object.
         what: Argument that takes it.
+        kind: Class of such objects.
         known: Classes by name.
 
     Raises:
         ValueError: If the name is unknown; it lists the valid ones.
     """
-    if FORMER.get(name) in known:
-        warn(
-            f"SA701 {what}={name!r} goes in the next version: use "
-            f'{what}="{FORMER[name]}", or "auto"',
-        )
-        name = FORMER[name]
-    if name not in known:
+    if given == "auto" or isinstance(given, kind):
+        return None if given == "auto" else given
+    if FORMER.get(given) in known:
+        now = FORMER[given]
+        warn(f'SA701 {what}={given!r} goes in the next version: use {what}="{now}"')
+        given = now
+    if given not in known:
         raise ValueError(
             f"expected {what} among 'auto', {', '.join(map(repr, known))}; got "
-            f"{name!r}; choose one of these or pass an object of your own"
+            f"{given!r}; choose one of these or pass an object of your own"
         )
-    return known[name]()
+    return known[given]()
 
 
 def choose_estimator(
@@ -118,24 +114,25 @@ def choose_estimator(
     """
     num_outcomes = simulations.x[0, 0].numel()
     declared = simulations.mean is not None and simulations.noise is not None
-    by_noise, notes = None, []
+    by_noise: dict[InformationGainEstimator, list[str]] = {}
     if declared or simulations.replicate is not None:
-        by_noise = NestedGain()
+        num_rows, linear = (
+            num_rows or len(simulations.theta),
+            LinearGain(max_bent=MAX_BENT),
+        )
+        many = declared and simulations.theta.shape[1] > MAX_NESTED_PARAMETERS
         if num_outcomes <= (1 if declared else MAX_NEIGHBOR_OUTCOMES):
-            by_noise = EntropyGain()
-        elif declared and simulations.theta.shape[1] > MAX_NESTED_PARAMETERS:
-            linear = LinearGain(max_bent=MAX_BENT)
-            if linear.suits(simulations, num_rows or len(simulations.theta)):
-                return linear, []
-        problems = by_noise.problems(simulations)
-        steps = EntropyGain().steps(simulations) if problems else []
-        if steps and isinstance(by_noise, EntropyGain):
-            notes = [f"EntropyGain not used: {steps[0]}"]
-            by_noise = NestedGain()
-            problems = by_noise.problems(simulations)
+            by_noise[EntropyGain()] = []
+        elif many and linear.suits(simulations, num_rows):
+            return linear, []
+        by_noise[NestedGain()] = []
+    notes: list[str] = []
+    for each, problems in by_noise.items():
+        problems += each.problems(simulations)
         if not problems:
-            return by_noise, notes
-        notes += [f"{type(by_noise).__name__} not used: {text}" for text in problems]
+            return each, notes
+        new = [text for text in problems if not any(text in note for note in notes)]
+        notes += [f"{type(each).__name__} not used: {text}" for text in new]
     if hasattr(model, "log_posterior"):
         return PosteriorGain(), notes
     if hasattr(model, "log_likelihood"):
@@ -146,48 +143,7 @@ def choose_estimator(
         if not cautions:
             return bound, notes
         return RatioGain(), [*notes, *(f"not used: {text}" for text in cautions)]
-    assert by_noise is not None
     if bool(random_presence(simulations).any()):
         return ParameterGain(), notes
-    return by_noise, [*notes, "used all the same: there is no model"]
-
-
-def disagreements(
-    estimator: InformationGainEstimator,
-    model: Any,
-    simulations: CandidateSimulations,
-    belief: Distribution | None,
-    gain: Tensor,
-    *,
-    negligible: float = 0.3,
-) -> list[str]:
-    """Return cautions about an estimate, which is compared with a bound.
-
-    That is the network's of an estimate without a bound, and InfoNCE of a ratio. There
-    is a sentence for a disagreement, by the contributions (a, n): four standard errors
-    beyond ``negligible`` nats.
-    """
-    notes, other = estimator.cautions(gain), None
-    # A model that is trained on demand is not trained for a note.
-    at_hand = estimator.bound == "none" and getattr(model, "is_trained", True)
-    if at_hand and hasattr(model, "log_posterior"):
-        other = PosteriorGain()
-    if isinstance(estimator, RatioGain):
-        other = InfoNCEGain()
-    if other is None:
-        return notes
-    estimate = other(model, simulations, belief)
-    difference = estimate - gain
-    error = torch.stack([standard_error(row) for row in difference])
-    mean = difference.nanmean(1)
-    apart = (mean.abs() > negligible + 4 * error) & (not other.cautions(estimate))
-    if bool(apart.any()):
-        worst = int(torch.where(apart, mean.abs(), 0.0).argmax())
-        side = "below" if float(mean[worst]) < 0 else "above"
-        blunt = " (a lower bound: the network is blunt)" if side == "below" else ""
-        notes.append(
-            f"{type(other).__name__} is {abs(float(mean[worst])):.1f} nats {side} at "
-            f"action {simulations.action[worst].tolist()}, apart at "
-            f"{int(apart.sum())} of {len(apart)}{blunt}"
-        )
-    return notes
+    least = min(by_noise, key=lambda each: len(by_noise[each]))
+    return least, [*notes, "used all the same: there is no model"]

@@ -184,6 +184,12 @@ class InformationGainEstimator(Shown, ABC):
         """Return cautions about contributions (a, n), as a limit that is near."""
         return []
 
+    def compared(
+        self, model: Any, simulations: CandidateSimulations, belief: Any, gain: Tensor
+    ) -> list[str]:
+        """Return cautions about contributions that came of these, as by a bound."""
+        return self.cautions(gain)
+
     def problems(self, simulations: CandidateSimulations) -> list[str]:
         """Say in short sentences what speaks against the estimator here."""
         return []

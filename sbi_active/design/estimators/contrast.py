@@ -22,6 +22,7 @@ from sbi_active.design.estimators.base import (
     CandidateSimulations,
     InformationGainEstimator,
     at_least,
+    standard_error,
 )
 from sbi_active.seeding import derive_seed, forked_generators
 
@@ -153,6 +154,38 @@ class RatioGain(_Critic):
         Thomas, Dutta, Corander, Kaski & Gutmann, Bayesian Analysis 2022 (LFIRE);
         Kleinegesse, Drovandi & Gutmann, Bayesian Analysis 2021 (the utility).
     """
+
+    @override
+    def compared(
+        self,
+        model: Any,
+        simulations: CandidateSimulations,
+        belief: Any,
+        gain: Tensor,
+        *,
+        negligible: float = 0.3,
+    ) -> list[str]:
+        """Return a caution where InfoNCE, which needs no normalization, is elsewhere.
+
+        Args:
+            model: Model with ``log_ratio``.
+            simulations: Simulations that the contributions are of.
+            belief: Belief that theta was drawn from.
+            gain: Contributions, shape (a, n).
+            negligible: Difference that counts beyond four standard errors, nats.
+        """
+        other = InfoNCEGain()
+        bound = other(model, simulations, belief)
+        error = torch.stack([standard_error(row) for row in bound - gain])
+        apart = (bound - gain).nanmean(1).abs() - negligible - 4 * error
+        worst = int(apart.nan_to_num(nan=-torch.inf).argmax())
+        if not bool(apart[worst] > 0) or other.cautions(bound):
+            return self.cautions(gain)
+        off = float((bound - gain)[worst].nanmean())
+        return [
+            f"InfoNCEGain is {abs(off):.1f} nats {'below' if off < 0 else 'above'} at "
+            f"action {simulations.action[worst].tolist()}: the ratio is not normalized"
+        ]
 
 
 class LikelihoodGain(_Critic):

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from sbi_active.design.estimators.base import CandidateSimulations, noise_scale
+from sbi_active.design.estimators.entropy import pair_noise
 from sbi_active.seeding import forked_generators
 from sbi_active.simulation import GaussianNoise
 
@@ -211,31 +212,23 @@ def emulated(simulations: CandidateSimulations) -> Emulated:
 def learned(simulations: CandidateSimulations) -> Emulated:
     r"""Return simulations of a model learned from pairs, whose noise is declared.
 
-    The noise of a candidate is Gaussian with the covariance of the pairs' differences,
-
-    .. math::
-        S = \frac{1}{2n} \sum_i (x_i - x_i') (x_i - x_i')^\top = L L^\top.
-
-    Averages of pairs, whitened by L, are smoothed over theta (:class:`MeanEmulator`).
-    Outcomes are drawn anew, :math:`\hat f(\theta_i) + \epsilon_i`, so that none had a
-    part in its own mean. Averages are off by the noise, so that none counts as missed.
+    The noise of a candidate is Gaussian with the covariance of the pairs' differences
+    (:func:`.pair_noise`). Averages of pairs, whitened by it, are smoothed over theta
+    (:class:`MeanEmulator`). Outcomes are drawn anew,
+    :math:`\hat f(\theta_i) + \epsilon_i`, so that none had a part in its own mean.
+    Averages are off by the noise, so that none counts as missed.
     """
-    assert simulations.replicate is not None
-    theta, complete = simulations.theta.double(), simulations.complete
+    theta = simulations.theta.double()
     x, again = (
         torch.where(
             part.flatten(2).isfinite().all(-1, keepdim=True),
             part.flatten(2).double(),
             torch.nan,
         )
-        for part in (simulations.x, simulations.replicate)
+        for part in simulations.outcomes()
     )
     num_actions, n, q = x.shape
-    difference = torch.where(complete[..., None], (x - again) / 2**0.5, 0.0)
-    share = complete.sum(1).clamp_min(1)[:, None, None]
-    rounding = torch.finfo(torch.float32).eps * x.abs().nan_to_num().amax(1)
-    floor = torch.diag_embed(rounding.square() + 1e-300)
-    factor = torch.linalg.cholesky(difference.mT @ difference / share + floor)
+    factor, _ = pair_noise(simulations)
     average = fill(theta, torch.stack([x, again]).nanmean(0)).mT
     white = torch.linalg.solve_triangular(factor, average, upper=False).mT
     emulator = MeanEmulator.fit(theta, white.transpose(0, 1).flatten(1), ridges=RIDGES)

@@ -36,8 +36,8 @@ class EntropyGain(InformationGainEstimator):
 
     The second entropy is that of the declared noise at the noise-free outcome. Without
     a declaration it is that of a Gaussian of one covariance, fitted to pairs of
-    outcomes at the same theta; :meth:`problems` tests normality, which noise that
-    varies with theta fails as well.
+    outcomes at the same theta; :func:`.problems_of_noise` tests normality, which noise
+    that varies with theta fails as well.
 
     Where outcomes lack numbers,
 
@@ -90,44 +90,9 @@ class EntropyGain(InformationGainEstimator):
     def remarks(self, simulations: CandidateSimulations) -> list[str]:
         return presence_notes(simulations)
 
-    def problems(
-        self,
-        simulations: CandidateSimulations,
-        *,
-        few: int = 20,
-        significant: float = 4.0,
-        max_kurtosis: float = 0.3,
-    ) -> list[str]:
-        r"""Test by pairs whether undeclared noise is Gaussian, and for steps.
-
-        Standardized differences of pairs have an excess kurtosis of zero, with a
-        standard error of :math:`\sqrt{24 / n}`, under Gaussian noise.
-
-        Args:
-            simulations: Simulations to look at.
-            few: Complete outcomes that are too few for either entropy.
-            significant: Number of standard errors of a kurtosis that is significant.
-            max_kurtosis: Excess below which the error of the entropy is negligible.
-        """
-        if int(simulations.complete.sum(1).max()) < few:
-            return [f"fewer than {few} complete outcomes a candidate"]
-        problems = presence_problems(simulations) + self.steps(simulations)
-        if simulations.noise is not None or simulations.replicate is None:
-            return problems
-        pooled = [
-            standardized_pairs(simulations, a, rows)[0].T.flatten()
-            for a, rows in enumerate(simulations.complete)
-            if int(rows.sum()) >= few
-        ]
-        z = torch.cat(pooled)
-        excess = float((z**4).mean() / (z**2).mean() ** 2 - 3)
-        limit = max(significant * (24 / len(z)) ** 0.5, max_kurtosis)
-        if abs(excess) <= limit:
-            return problems
-        return [
-            *problems,
-            f"noise is not Gaussian, excess kurtosis of pairs {excess:.1f}",
-        ]
+    @override
+    def problems(self, simulations: CandidateSimulations) -> list[str]:
+        return problems_of_noise(simulations) + self.steps(simulations)
 
     def steps(
         self, simulations: CandidateSimulations, *, most: float = 0.1, few: float = 3
@@ -187,17 +152,16 @@ def conditional_entropy(
     noise.
     """
     mean, noise = simulations.mean, simulations.noise
-    shape = simulations.x.shape[:2]
     if mean is None or noise is None:
-        entropy = torch.full(shape, torch.nan, dtype=torch.float64)
-        share = simulations.completeness.mean(1)
-        for a, rows in enumerate(simulations.complete):
-            if int(rows.sum()) > simulations.x[a, 0].numel() + 1:
-                z, entropy[a] = standardized_pairs(simulations, a, rows)
-                # the noise is estimated: of mean zero, so that errors include it
-                square = torch.linalg.solve(z.T @ z / len(z), z.T)
-                influence = 0.5 * ((z.T * square).sum(0) - z.shape[1])
-                entropy[a, rows] += share[a] / rows.double().mean() * influence
+        complete, (factor, white) = simulations.complete, pair_noise(simulations)
+        q = white.shape[2]
+        entropy = factor.diagonal(dim1=1, dim2=2).log().sum(1)
+        entropy = (entropy + 0.5 * q * (math.log(2 * math.pi) + 1))[:, None]
+        # the noise is estimated: of mean zero, so that errors include it
+        influence = torch.where(complete, 0.5 * (white.square().sum(2) - q), 0.0)
+        share = simulations.completeness.mean(1) / complete.double().mean(1)
+        entropy = entropy + share[:, None] * influence
+        entropy[complete.sum(1) <= q + 1] = torch.nan
         return entropy, entropy
     mean = mean.flatten(0, 1).double()
     surprise = -noise.log_prob(simulations.x.flatten(0, 1), mean)
@@ -205,24 +169,29 @@ def conditional_entropy(
     with forked_generators(0):
         for _ in range(num_draws):
             entropy -= noise.log_prob(noise.sample(mean), mean) / num_draws
+    shape = simulations.x.shape[:2]
     return entropy.reshape(shape), surprise.reshape(shape)
 
 
-def standardized_pairs(
-    simulations: CandidateSimulations, index: int, rows: Tensor
-) -> tuple[Tensor, float]:
-    """Fit Gaussian noise of one covariance to pairs of one candidate, of rows (n,).
+def pair_noise(simulations: CandidateSimulations) -> tuple[Tensor, Tensor]:
+    r"""Fit Gaussian noise of one covariance a candidate to its complete pairs.
 
-    Returns standardized differences of the pairs, and the entropy of the noise.
+    .. math::
+        S = \frac{1}{2n} \sum_i (x_i - x_i') (x_i - x_i')^\top = L L^\top
+
+    Returns L, shape (a, q, q), and the pairs' differences in its units, (a, n, q), zero
+    where they are incomplete.
     """
     assert simulations.replicate is not None
-    difference = simulations.x[index, rows] - simulations.replicate[index, rows]
-    difference = difference.flatten(1).double() / 2**0.5
-    scale = difference.square().mean(0).clamp_min(1e-60).sqrt()
-    standardized = difference / scale
-    correlation = standardized.T @ standardized / len(standardized)
-    log_det = float(torch.linalg.slogdet(correlation).logabsdet + 2 * scale.log().sum())
-    return standardized, 0.5 * (len(scale) * (math.log(2 * math.pi) + 1) + log_det)
+    x, again = (part.flatten(2).double() for part in simulations.outcomes())
+    complete = simulations.complete
+    difference = torch.where(complete[..., None], (x - again) / 2**0.5, 0.0)
+    share = complete.sum(1).clamp_min(1)[:, None, None]
+    rounding = torch.finfo(torch.float32).eps * x.abs().nan_to_num().amax(1)
+    floor = torch.diag_embed(rounding.square() + 1e-300)
+    factor = torch.linalg.cholesky(difference.mT @ difference / share + floor)
+    white = torch.linalg.solve_triangular(factor, difference.mT, upper=False).mT
+    return factor, white
 
 
 def with_control(gain: Tensor, excess: Tensor) -> Tensor:
@@ -283,7 +252,7 @@ def presence_information(simulations: CandidateSimulations) -> Tensor:
 
     With v the pattern of NaN in x, a function of theta as it is of a noise-free
     simulator with declared noise, :math:`I(\theta; v) = H(v)`, from shares. Nothing is
-    counted where replicates show v to be random, see :func:`presence_problems`.
+    counted where replicates show v to be random, see :func:`problems_of_noise`.
     """
     patterns, counted = _patterns(simulations), simulations.counted
     gain = torch.zeros(counted.shape, dtype=torch.float64)
@@ -303,11 +272,30 @@ def random_presence(simulations: CandidateSimulations) -> Tensor:
     return ((first != second) & simulations.counted).any(1)
 
 
-def presence_problems(
-    simulations: CandidateSimulations, *, max_partly: float = 0.1
+def problems_of_noise(
+    simulations: CandidateSimulations,
+    *,
+    few: int = 20,
+    max_partly: float = 0.1,
+    significant: float = 4.0,
+    max_kurtosis: float = 0.3,
 ) -> list[str]:
-    """Say what of incomplete outcomes would not count, which leaves a lower bound."""
-    problems = []
+    r"""Say what speaks against entropies of the noise, declared or of pairs.
+
+    That is what of incomplete outcomes would not count, which leaves a lower bound, and
+    undeclared noise that is not Gaussian: standardized differences of pairs have an
+    excess kurtosis of zero then, with a standard error of :math:`\sqrt{24 / n}`.
+
+    Args:
+        simulations: Simulations to look at.
+        few: Complete outcomes that are too few.
+        max_partly: Share of partly observed outcomes that is negligible.
+        significant: Number of standard errors of a kurtosis that is significant.
+        max_kurtosis: Excess below which the error of the entropy is negligible.
+    """
+    complete, problems = simulations.complete, []
+    if int(complete.sum(1).max()) < few:
+        return [f"fewer than {few} complete outcomes a candidate"]
     if bool(random_presence(simulations).any()):
         problems.append(
             "whether there is a measurement is random given the parameters, which does "
@@ -318,6 +306,14 @@ def presence_problems(
         problems.append(
             f"{share:.0%} of the outcomes are partly observed, their numbers not used"
         )
+    if simulations.noise is None and simulations.replicate is not None:
+        enough = complete.sum(1, keepdim=True) >= few
+        z = pair_noise(simulations)[1][complete & enough].flatten()
+        excess = float((z**4).mean() / (z**2).mean() ** 2 - 3)
+        if abs(excess) > max(significant * (24 / len(z)) ** 0.5, max_kurtosis):
+            problems.append(
+                f"noise is not Gaussian, excess kurtosis of pairs {excess:.1f}"
+            )
     return problems
 
 

@@ -33,9 +33,6 @@ class Evidence:
         degrees: Degrees of freedom of the Student-t proposals; even.
         wider: Width of the proposals, in those of the linearized posterior.
         enough: Effective draws of the belief that need no local ones.
-        defense: Period of the local draws that are close to theta_i itself, lest all
-            others miss.
-        closer: Width of these, in those of the proposals.
         rare: Relative variance of an evidence that rests on a draw or two.
     """
 
@@ -47,8 +44,6 @@ class Evidence:
     degrees: int = 6
     wider: float = 1.2
     enough: int = 50
-    defense: int = 4
-    closer: float = 0.2
     rare: float = 0.5
 
     def __post_init__(self) -> None:
@@ -119,13 +114,11 @@ class Evidence:
         """
         x = self.x[i]
         location, precision = self._linearized(x, slope, i)
-        factor = self.wider * torch.linalg.cholesky(torch.linalg.inv(precision))
+        factor = self.wider * torch.linalg.inv(torch.linalg.cholesky(precision)).mT
         (n, d), num_local = location.shape, self.num_local
         ratio = math.log(num_local / (len(self.knots) - 1))
         step = _student((n, num_local, d), self.degrees) @ factor.mT
-        near = (torch.arange(num_local) % self.defense == 0)[:, None]
-        start = self.knots[i][:, None]
-        z = torch.where(near, start + self.closer * step, location[:, None] + step)
+        z = location[:, None] + step
         flat = z.flatten(0, 1)
         log_b = _log_belief(self.belief, self.known.emulator, flat).reshape(
             n, num_local
@@ -135,12 +128,12 @@ class Evidence:
         outcome = x.repeat_interleave(num_local, 0)[inside]
         local = torch.full((n * num_local,), -torch.inf).double()
         local[inside] = self.noise.log_prob(outcome, mean.reshape(outcome.shape))
-        log_t = self._log_proposal(z, location, i, factor)
+        log_t = _log_student(z - location[:, None], factor, self.degrees)
         local[inside] += self._log_complete(flat[inside])
         local = local.reshape(n, num_local) - torch.nn.functional.softplus(
             ratio + torch.where(log_b.isfinite(), log_t - log_b, 0.0)
         )
-        log_t = self._log_proposal(self.knots, location, i, factor)
+        log_t = _log_student(self.knots - location[:, None], factor, self.degrees)
         shared = shared - torch.nn.functional.softplus(ratio + log_t - self.log_belief)
         least = self.noise.log_prob(x, self.mean[i]) + self.log_belief[i]
         least += 0.5 * (d * math.log(math.pi / 2) - torch.logdet(precision))
@@ -163,18 +156,6 @@ class Evidence:
             return torch.zeros(len(z), dtype=z.dtype)
         nearest = torch.cdist(z, self.knots[self.counted]).argmin(1)
         return share[nearest].log()
-
-    def _log_proposal(
-        self, z: Tensor, location: Tensor, i: Tensor, factor: Tensor
-    ) -> Tensor:
-        """Log density of the local draws, shape (i, k)."""
-        mode = _log_student(z - location[:, None], factor, self.degrees)
-        near = _log_student(
-            z - self.knots[i][:, None], self.closer * factor, self.degrees
-        )
-        return torch.logaddexp(
-            mode + math.log(1 - 1 / self.defense), near - math.log(self.defense)
-        )
 
     def _linearized(self, x: Tensor, slope: Tensor, i: Tensor) -> tuple[Tensor, Tensor]:
         """Location and precision of the posterior given x, one step from theta_i.
@@ -243,7 +224,7 @@ def _student(shape: tuple[int, ...], degrees: int) -> Tensor:
 
 
 def _log_student(offset: Tensor, factor: Tensor, degrees: int) -> Tensor:
-    """Log density at offsets (n, k, d) with lower factors (n, d, d)."""
+    """Log density at offsets (n, k, d) with triangular factors (n, d, d)."""
     square = (offset @ torch.linalg.inv(factor).mT).square().sum(-1)
     log_volume = factor.diagonal(dim1=-2, dim2=-1).log().sum(-1, keepdim=True)
     known = square.numpy(), log_volume.numpy(), offset.shape[-1], degrees

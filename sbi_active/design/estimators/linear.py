@@ -95,9 +95,9 @@ class LinearGain(InformationGainEstimator):
         for row in mean:
             y = noise.whiten(row).flatten(1)
             complete = y.isfinite().all(1)
-            off = _off_plane(theta[complete])
-            rest = off @ y[complete]
-            bent.append(float((rest.square().sum() / off.trace() / y.shape[1]).sqrt()))
+            rest, rank = _off_plane(theta[complete], y[complete])
+            freedom = (len(rest) - 1 - rank) * y.shape[1]
+            bent.append(float((rest.square().sum() / freedom).sqrt()))
         worst = max(bent, default=0.0)
         if worst <= self.max_bent:
             return []
@@ -152,37 +152,34 @@ def _jackknife(theta: Tensor, y: Tensor) -> Tensor:
             f"LinearGain of {d} parameters; got {n}; pass num_samples of "
             f"{4 * (fewest + 2)} or more for a list, {12 * (fewest + 2)} for a box"
         )
-    y, ones = y - y.mean(0), torch.ones(n, 1, dtype=y.dtype)
+    y = y - y.mean(0)
     if y.shape[1] > n:  # along the span of the outcomes
         y = torch.linalg.qr(y.T).R.T
-    basis = n**0.5 * _basis(theta)
-    known = 1, 1 + basis.shape[1]
-    rows = torch.cat([ones, basis, y], 1)
     group = torch.arange(n) % groups
-    parts = [rows[group == g] for g in range(groups)]
-    moments = torch.stack([part.T @ part for part in parts])
-    whole = moments.sum(0)
-    moments = torch.cat([whole[None], whole - moments])
-    count = torch.tensor([n, *(n - len(part) for part in parts)], dtype=y.dtype)
+    whole = _information(theta, y)
+    each = [
+        _information(theta[kept], y[kept])
+        for kept in group != torch.arange(groups)[:, None]
+    ]
+    return (groups * whole - (groups - 1) * torch.stack(each))[group]
+
+
+def _information(theta: Tensor, y: Tensor) -> Tensor:
+    """Return the information of outcomes (n, N) as if linear in theta (n, d), nats."""
+    rest, _ = _off_plane(theta, y)
+    n, d = theta.shape
+    spread = torch.cov(y.T).reshape(y.shape[1], -1), rest.T @ rest / (n - 1 - d)
     one = torch.eye(y.shape[1], dtype=y.dtype)
-    left = []
-    for num, lost in zip(known, (1, 1 + d), strict=True):  # the mean, and the plane
-        beside = moments[:, :num, known[1] :]
-        slope = torch.linalg.solve(moments[:, :num, :num], beside)
-        rest = moments[:, known[1] :, known[1] :] - beside.mT @ slope
-        left.append(torch.linalg.slogdet(one + rest / (count - lost)[:, None, None])[1])
-    each = 0.5 * (left[0] - left[1])
-    return (groups * each[0] - (groups - 1) * each[1:])[group]
+    both = torch.linalg.slogdet(one + torch.stack(spread)).logabsdet
+    return 0.5 * (both[0] - both[1])
 
 
-def _basis(theta: Tensor) -> Tensor:
-    """Return orthonormal functions (n, k) of theta that are linear, of no mean."""
-    apart = (theta - theta.mean(0)) / theta.std(0).clamp(min=1e-300)
+def _off_plane(theta: Tensor, y: Tensor) -> tuple[Tensor, int]:
+    """Return what of outcomes (n, N) no linear function of theta follows.
+
+    Beside it is the rank of the parameters (n, d).
+    """
+    apart, off = (theta - theta.mean(0)) / theta.std(0).clamp(min=1e-300), y - y.mean(0)
     basis, values, _ = torch.linalg.svd(apart, full_matrices=False)
-    return basis[:, values > 1e-9 * values[0]]
-
-
-def _off_plane(theta: Tensor) -> Tensor:
-    """Return the projection (n, n) on what no linear function of theta follows."""
-    basis, n = _basis(theta), len(theta)
-    return torch.eye(n, dtype=theta.dtype) - basis @ basis.T - 1 / n
+    basis = basis[:, values > 1e-9 * values[0]]
+    return off - basis @ (basis.T @ off), basis.shape[1]

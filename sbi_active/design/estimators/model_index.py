@@ -187,16 +187,11 @@ class ModelIndexGain(InformationGainEstimator):
         weight = self.probability[index] * len(self.probability)
         gain = torch.full(simulations.x.shape[:2], torch.nan, dtype=torch.float64)
         block = _blocks(simulations, index, len(self.probability))
-        known = simulations.mean, simulations.sd
+        known = [p for p in (simulations.mean, simulations.sd) if p is not None]
         for a, rows, columns, x in by_pattern(simulations, 4 * self.few):
-            noise = [
-                part[a].flatten(1)[rows][:, columns].double()
-                for part in known
-                if part is not None
-            ]
-            counted = simulations.counted[a]
-            score = self._score(x, noise, rows, counted, index, block)
-            gain[a, rows] = weight[rows] * score
+            noise = [p[a].flatten(1)[rows][:, columns].double() for p in known]
+            given = x, noise, rows, simulations.counted[a], index, block
+            gain[a, rows] = weight[rows] * self._score(*given)
         return gain
 
     def _score(
@@ -232,13 +227,12 @@ class ModelIndexGain(InformationGainEstimator):
             hits = torch.bincount(own[train], minlength=num_models) + 0.5
             share = hits / (torch.bincount(index[used], minlength=num_models) + 1)
             log_prior = log_p + share.log()
-            narrow = []
+            members = class_members(x[train], own[train], enough)
             if len(noise) == 2:
                 center, width = (part[train] for part in noise)
-                narrow = noise_members(center, width, own[train], enough)
-            wide = class_members(x[train], own[train], enough)
+                members += noise_members(center, width, own[train], enough)
             scores = []
-            for member in [*wide, *narrow]:
+            for member in members:
                 log_f = member(x[test])
                 for power in powers:
                     log_q = (log_prior + power * log_f).log_softmax(1)

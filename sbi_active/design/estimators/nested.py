@@ -21,7 +21,7 @@ from sbi_active.design.estimators.entropy import (
     conditional_entropy,
     presence_information,
     presence_notes,
-    presence_problems,
+    problems_of_noise,
     with_control,
 )
 from sbi_active.design.estimators.evidence import Evidence
@@ -40,10 +40,9 @@ class NestedGain(InformationGainEstimator):
 
     The m = n - 1 other simulations are draws of the belief b with their exact
     noise-free outcomes. Where fewer than 50 of them are effective, l draws of a
-    Student-t :math:`t_i` around the linearized posterior given :math:`x_i` join, every
-    fourth of them close to :math:`\theta_i` instead, where the outcome is known. Their
-    outcomes come from a :class:`.MeanEmulator` of
-    the noise-free outcomes of all simulations, so no further ones are run.
+    Student-t :math:`t_i` around the linearized posterior given :math:`x_i` join. Their
+    outcomes come from a :class:`.MeanEmulator` of the noise-free outcomes of all
+    simulations, so no further ones are run.
 
     Jensen's bias, half the relative variance of :math:`\hat p`, is subtracted. The
     estimate is too large where the posterior has modes that neither the simulations
@@ -148,21 +147,16 @@ class NestedGain(InformationGainEstimator):
             few: Complete outcomes that are too few for an emulator; five pairs for each
                 number of x are needed to estimate its noise.
         """
-        needed = few
-        if simulations.noise is None:
-            needed = max(few, 5 * simulations.x[0, 0].numel())
-        if int(simulations.complete.sum(1).max()) < needed:
-            return [f"fewer than {needed} complete outcomes a candidate"]
-        if simulations.noise is None:
-            problems = EntropyGain().problems(simulations)
-            missed = learned(simulations).emulator.error.square().mean(0) > 1
-            share = float(missed.double().mean())
-            if share > 0.5:
-                problems.append(f"smoothing misses {share:.0%} of the numbers of x")
+        declared, numbers = simulations.noise is not None, simulations.x[0, 0].numel()
+        needed = few if declared else max(few, 5 * numbers)
+        problems = problems_of_noise(simulations, few=needed)
+        if numbers > 1:  # of one it is .2 nat too high at most
+            problems += EntropyGain().steps(simulations)
+        if declared or problems:
             return problems
-        is_one = simulations.x[0, 0].numel() == 1  # then .2 nat too high at most
-        steps = [] if is_one else EntropyGain().steps(simulations)
-        return presence_problems(simulations) + steps
+        missed = learned(simulations).emulator.error.square().mean(0) > 1
+        share = float(missed.double().mean())
+        return [f"smoothing misses {share:.0%} of the numbers of x"] * (share > 0.5)
 
     @override
     def needs_slopes(
