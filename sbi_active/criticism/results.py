@@ -234,7 +234,6 @@ class Tracing:
         estimates: Estimates, one an effect, most probable first.
         evidences: Evidence of every model tried, by name. Priors of effects have
             unknown scale.
-        robust: Whether effect priors a third and three times as wide agree.
         guesses: Formula effects, best first: (formula, log evidence above
             "unexplained"), which is empty unless nothing declared explains the data.
         beside: Effects that explain most of what is "unexplained", the residual process
@@ -272,7 +271,6 @@ class Tracing:
     near: tuple[frozenset[str], ...]
     estimates: tuple[Estimate, ...]
     evidences: dict[str, Evidence]
-    robust: bool
     guesses: tuple[tuple[str, float], ...] = ()
     beside: tuple[str, ...] = ()
     outliers: dict[float, float] = field(default_factory=dict)

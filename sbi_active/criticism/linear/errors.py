@@ -181,7 +181,6 @@ class Errors:
         use: NDArray[np.bool_] | None = None,
         *,
         beside: bool,
-        factor: float = 1.0,
     ) -> Mixture:
         """Return the evidence and the posterior of a model.
 
@@ -191,14 +190,12 @@ class Errors:
             use: Parts of the trials that count, shape (f,); None takes all.
             beside: Whether there is a residual process beside the sensor's error, or a
                 parameter that differs from trial to trial.
-            factor: Factor on the scales of the effects' priors.
         """
         some = np.ones(self.num_folds, bool) if use is None else use
         state = UNEXPLAINED if beside else None
         gram, log_weight = self.hypotheses(model, grams, some, state)
         log_weight = log_weight + model.offset[some[self.fold]].sum()
-        widths = [factor * width for width in WIDTHS]
-        return summed(gram, log_weight, model, widths)
+        return summed(gram, log_weight, model, WIDTHS)
 
     def hypotheses(
         self,

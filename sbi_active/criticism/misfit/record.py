@@ -77,7 +77,6 @@ def traced(
         near=groups,
         estimates=_estimates(found, evidences),
         evidences=evidences,
-        robust=found.is_robust(),
         guesses=_guesses(found),
         beside=tuple(n for n in helps if n not in named),
         trial_names=dict(zip(trials.index.tolist(), trials.names, strict=True)),

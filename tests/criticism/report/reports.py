@@ -72,7 +72,6 @@ def tracing(verdict: str = "drag", **changes) -> Tracing:
         near=(),
         estimates=tuple(estimate(n, probabilities[n]) for n in NAMES),
         evidences={n: evidence(n, -3.0) for n in ["none", *NAMES, "unexplained"]},
-        robust=True,
     )
     return replace(made, **changes)
 

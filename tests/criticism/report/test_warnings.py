@@ -141,7 +141,6 @@ CASES = {
     "SA514": ({"evaluation": replace(HELD, missed=(MISSED,))}, {}),
     "SA515": (pushed(3.0), pushed(2.0)),
     "SA516": (pushed(3.0), pushed(3.0, "dynamics")),
-    "SA517": (told(robust=False), told()),
     "SA518": (told("unexplained"), told("scatter")),
     "SA519": (told("scatter"), told("unexplained")),
     "SA520": ({"exploratory": True}, {}),

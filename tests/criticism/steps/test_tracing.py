@@ -92,13 +92,6 @@ def test_what_an_effect_leaves_over_is_unexplained_beside_it():
     assert not tracing.misfit.passes
 
 
-@pytest.mark.parametrize(
-    ("phi", "robust"), [({"curve": 0.065}, False), ({"curve": 0.5}, True), ({}, True)]
-)
-def test_a_verdict_that_hangs_on_the_width_of_a_prior_is_not_robust(phi, robust):
-    assert tracing_of(measured(**phi))[0].robust == robust
-
-
 def test_effects_that_the_trials_do_not_separate_count_as_one():
     twin = added("twin", lambda xi: 0.5 * (xi**2 - 1), family="dynamics")
     group = frozenset({"curve", "twin"})
