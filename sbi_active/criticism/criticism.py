@@ -221,12 +221,11 @@ class Criticism:
 
     @cached_property
     def _traced(self) -> tuple[Tracing, RivalSet]:
-        found, large = self._verdict, self._is_large
+        found = self._verdict
         # Each model's held-out errors would take as much as the verdict.
-        held_out = None if large else self._parts[1].held_out
+        held_out = None if self._is_large else self._parts[1].held_out
         with stage("verdict, sets of effects fitted", show_progress=self.show_progress):
-            actions = None if large else self.actions  # the next action looks for more
-            tracing, models = traced(found, held_out, actions=actions, near=not large)
+            tracing, models = traced(found, held_out)
         return replace(tracing, set_aside=self.set_aside), models
 
     def add(

@@ -227,10 +227,10 @@ class Tracing:
             probable first.
         equivalent: Groups of names that no permitted action separates ("none" for an
             effect that shows nowhere).
-        near: Groups for the trials at hand alone; another action may separate them.
         aliases: After an alarm, pairs of an effect of the verdict and one that explains
             the data about as well (log evidence within log 20 of the best) with
-            predictions closer than the noise; repeated trials may separate them.
+            predictions of the trials closer than the noise; another action, or repeated
+            trials, may separate them.
         estimates: Estimates, one an effect, most probable first.
         evidences: Evidence of every model tried, by name. Priors of effects have
             unknown scale.
@@ -268,7 +268,6 @@ class Tracing:
     inclusion: dict[str, float]
     credible_set: tuple[str, ...]
     equivalent: tuple[frozenset[str], ...]
-    near: tuple[frozenset[str], ...]
     estimates: tuple[Estimate, ...]
     evidences: dict[str, Evidence]
     guesses: tuple[tuple[str, float], ...] = ()

@@ -306,13 +306,11 @@ def _sizes_left(report: Contents) -> dict[str, Any]:
 def _groups(report: Contents) -> list[tuple[frozenset[str], str]]:
     """Return the groups of models that nothing separates, or not these trials."""
     tracing = report.tracing
-    near = [group for group in tracing.near if group not in tracing.equivalent]
     like = [frozenset.union(*tracing.aliases)] if tracing.aliases else []
     why = {
         "no permitted action separates them": tracing.equivalent,
-        "not separated by these trials; another action may": near,
-        "nearly the same here, apart by less than the noise; repeated trials may "
-        "separate them": like,
+        "nearly the same here, apart by less than the noise; another action or "
+        "repeated trials may separate them": like,
     }
     return [(group, said) for said, groups in why.items() for group in groups]
 

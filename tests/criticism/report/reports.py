@@ -69,7 +69,6 @@ def tracing(verdict: str = "drag", **changes) -> Tracing:
         inclusion={"drag": 0.81, "tilt": 0.125, "bias": 0.05},
         credible_set=("drag", "tilt"),
         equivalent=(),
-        near=(),
         estimates=tuple(estimate(n, probabilities[n]) for n in NAMES),
         evidences={n: evidence(n, -3.0) for n in ["none", *NAMES, "unexplained"]},
     )
