@@ -30,7 +30,6 @@ from sbi_active.criticism.results import (
 )
 from sbi_active.criticism.rivals.rival import surprising_outcomes
 from sbi_active.criticism.steps.detection import REFUTED, TOO_SMALL
-from sbi_active.criticism.steps.missed_trials import outlying_trials
 from sbi_active.messages import Message
 from sbi_active.seeding import forked_generators
 from sbi_active.simulation.conditions import parameters_of
@@ -76,7 +75,6 @@ def cautions(
         suspects=suspects_in_words(tracing),
         rests=rests(tracing) if tracing.needed else "",
         narrow_prior=narrow_prior(tracing),
-        outliers=() if loop is None else _outlying(loop, tracing),
     )
     return (*map(Message, dict.fromkeys(said)),)
 
@@ -115,18 +113,6 @@ def _may_be_force(report: Contents) -> bool:
     is_tried = any(e.family.startswith((FAMILY, COUPLING)) for e in tracing.estimates)
     taken = [p.name for p in parameters_of(report.simulator.fn)]
     return "force" in taken and not is_tried
-
-
-def _outlying(loop: Any, tracing: Tracing) -> list[tuple[str, float]]:
-    """Return the fitted trials that err far more than the others, and how much."""
-    misfit, trials = tracing.misfit, loop.rivals.trials
-    if misfit is None or misfit.left_out != "trials":
-        return []
-    squares = misfit.of(tracing.model).parts
-    measured = [k for k, valid in enumerate(trials.valid.tolist()) if valid]
-    if len(squares) != len(measured):  # a trial that no other tells about
-        return []
-    return [(trials.names[measured[k]], t) for k, t in outlying_trials(squares)]
 
 
 def _aliased(trials: Trials, *, limit: float = 0.9) -> bool:
