@@ -8,8 +8,12 @@ from typing import Literal
 import pandas as pd
 
 from sbi_active.arrays import Array
-from sbi_active.criticism.contradictions import Bounds, MissedTrial, OutlyingTrial
-from sbi_active.criticism.under_misfit import Misfit
+from sbi_active.criticism.contradictions import (
+    Bounds,
+    Misfit,
+    MissedTrial,
+    OutlyingTrial,
+)
 
 #: What is no effect: the bare model, the residual process, noise inflation, and a gross
 #: error of one trial.

@@ -38,8 +38,7 @@ from sbi_active.criticism.linear.processes import (
     time_scales,
 )
 from sbi_active.criticism.results import OUTLIER, UNEXPLAINED
-from sbi_active.criticism.rivals.error_models import LOG_2PI, NoiseGrid
-from sbi_active.criticism.rivals.noise_grid import LARGEST, sizes
+from sbi_active.criticism.rivals.error_models import LARGEST, LOG_2PI, NoiseGrid, sizes
 from sbi_active.criticism.steps.predictive import is_first_part
 from sbi_active.inference.sampling.weights import log_sum_exp
 

@@ -10,14 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sbi_active.arrays import Array
-from sbi_active.criticism.evidence.fit import Fit, Spread
-from sbi_active.criticism.evidence.rival_set import NUM_DRAWS, RivalSet
 from sbi_active.criticism.linear.fits import refitted
 from sbi_active.criticism.linear.model import LinearModel
 from sbi_active.criticism.linear.search import Search
 from sbi_active.criticism.misfit.verdict import Verdict
 from sbi_active.criticism.results import FEW_DRAWS, OUTLIER, ModelKey
+from sbi_active.criticism.rivals.fit import Fit, Spread
 from sbi_active.criticism.rivals.rival import Rival
+from sbi_active.criticism.rivals.rival_set import NUM_DRAWS, RivalSet
 from sbi_active.criticism.steps.detection import THRESHOLD
 from sbi_active.inference.engine import WeightedDraws
 from sbi_active.seeding import derive_seed

@@ -10,8 +10,9 @@ from typing import Any
 import numpy as np
 
 from sbi_active.arrays import Array
+from sbi_active.criticism.contradictions import Misfit as Found
+from sbi_active.criticism.contradictions import ModelError
 from sbi_active.criticism.data.trials import Trials
-from sbi_active.criticism.evidence.rival_set import RivalSet
 from sbi_active.criticism.linear.model import LinearModel
 from sbi_active.criticism.misfit.contrary import is_left_to_chance, withdrawn
 from sbi_active.criticism.misfit.draws import posterior, shown
@@ -25,10 +26,9 @@ from sbi_active.criticism.results import (
     ModelKey,
     Tracing,
 )
+from sbi_active.criticism.rivals.rival_set import RivalSet
 from sbi_active.criticism.steps.detection import THRESHOLD, credible_set
 from sbi_active.criticism.steps.predictive import predict
-from sbi_active.criticism.under_misfit import Misfit as Found
-from sbi_active.criticism.under_misfit import ModelError
 from sbi_active.seeding import derive_seed
 
 #: Probability from which an admitted model is recorded with its errors and draws.

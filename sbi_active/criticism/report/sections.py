@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from sbi_active.criticism.contradictions import Misfit
 from sbi_active.criticism.report.contents import Contents, by_channel, root_mean_square
 from sbi_active.criticism.report.figures import CAPTIONS, METRICS
 from sbi_active.criticism.report.words import (
@@ -30,7 +31,6 @@ from sbi_active.criticism.report.words import (
 )
 from sbi_active.criticism.results import FEW_DRAWS, NONE, ModelKey
 from sbi_active.criticism.steps.detection import LEVEL
-from sbi_active.criticism.under_misfit import Misfit
 from sbi_active.display.page import Page, Picture, Section
 from sbi_active.display.table import Table
 from sbi_active.messages import Message, place

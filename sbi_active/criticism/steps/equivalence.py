@@ -14,12 +14,12 @@ from sbi_active.actions import ActionSpace
 from sbi_active.arrays import Array
 from sbi_active.criticism.data.trials import Trials
 from sbi_active.criticism.effects.effect import Effect
-from sbi_active.criticism.evidence.rival_set import RivalSet
+from sbi_active.criticism.effects.trial_conditions import unmeasured
 from sbi_active.criticism.forces.library import is_force
 from sbi_active.criticism.results import NONE
 from sbi_active.criticism.rivals.coordinates import SearchCoordinates
-from sbi_active.criticism.rivals.further_trials import unmeasured
-from sbi_active.criticism.rivals.noise_grid import declared_noise
+from sbi_active.criticism.rivals.error_models import declared_noise
+from sbi_active.criticism.rivals.rival_set import RivalSet
 from sbi_active.criticism.rivals.trial_simulator import TrialSimulator
 from sbi_active.inference.sampling.least_squares import basis_of
 from sbi_active.seeding import derive_seed, forked_generators

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from sbi_active.criticism import Trials
-from sbi_active.criticism.data.sampling import Sampling, suggested_sampling, thinned
+from sbi_active.criticism.linear.screening import Sampling, suggested_sampling, thinned
 from tests.effects import autocorrelated
 
 STEP = 0.02

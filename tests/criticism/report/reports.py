@@ -9,6 +9,7 @@ from sbi.utils import BoxUniform
 
 from sbi_active import DiscreteActions, GaussianNoise, SimulatorModel
 from sbi_active.criticism import Trials
+from sbi_active.criticism.contradictions import Misfit, ModelError, Support
 from sbi_active.criticism.report.report import build_report
 from sbi_active.criticism.results import (
     Detection,
@@ -20,7 +21,6 @@ from sbi_active.criticism.results import (
     Residuals,
     Tracing,
 )
-from sbi_active.criticism.under_misfit import Misfit, ModelError, Support
 from tests.effects import on_outcomes
 
 DRAG = on_outcomes("drag", lambda x, phi, action, context: x - phi)

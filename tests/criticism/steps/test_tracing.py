@@ -8,10 +8,10 @@ import torch
 from scipy.stats import norm
 
 from sbi_active.criticism import Trials
-from sbi_active.criticism.evidence.rival_set import RivalSet
 from sbi_active.criticism.misfit.evaluation import evaluate_held_out, evaluate_left_out
 from sbi_active.criticism.misfit.record import traced
 from sbi_active.criticism.results import ModelKey
+from sbi_active.criticism.rivals.rival_set import RivalSet
 from sbi_active.criticism.steps.predictive import find_residuals
 from tests.criticism.steps import linear_world
 from tests.criticism.steps.linear_world import (
