@@ -136,10 +136,8 @@ def _shown(found: Verdict) -> list[ModelKey]:
 
 def _guesses(found: Verdict) -> tuple[tuple[str, float], ...]:
     """Return what the residual may follow where nothing that was declared explains."""
-    known, is_timed = found.search.sensor.is_known, found.timed
-    answered = found.named or (is_timed and found.is_missed and found.helps)
     is_open = found.is_missed or found.key.error == UNEXPLAINED
-    if answered or not is_open or not (known or not is_timed):
+    if found.timed or found.named or not is_open:
         return ()
     return guess_residual(found.search)
 

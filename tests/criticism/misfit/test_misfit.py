@@ -144,23 +144,6 @@ def test_an_effect_that_the_trials_refute_is_not_like_the_verdict():
 # What the residual follows where no declared effect helps
 
 
-@pytest.mark.parametrize(
-    ("size", "power", "hidden", "guess"),
-    [(0.15, 2, 0.05, "x^2"), (-0.1, 0, 0.3, "x'")],
-)
-def test_what_the_sensor_does_is_guessed(size, power, hidden, guess):
-    own = trials(hidden=hidden)
-    slope = torch.gradient(own.x, spacing=0.2, dim=1)[0]
-    own.x += size * (own.x**power if power else slope)
-    found = loop(own, [EFFECTS[1], EFFECTS[3]])
-    tracing = found.trace()
-    assert tracing.misfit is not None
-    assert tracing.chosen == ()
-    name, gain = tracing.guesses[0]
-    assert name == found.report(evaluate=False, plan=False).guess == guess
-    assert gain > 5
-
-
 def guesses(further):
     """Return what the residual follows of the bare model of numbers without times."""
     return guess_residual(linear_models(rivals(measured(further=further)))[0])
