@@ -19,9 +19,6 @@ from sbi_active.criticism.contradictions import (
 #: error of one trial.
 NONE, UNEXPLAINED, SCATTER, OUTLIER = "none", "unexplained", "scatter", "outlier"
 CATCH_ALLS = (UNEXPLAINED, SCATTER, OUTLIER)
-#: Effective draws below which a deviation is none to print: of 50 it is off by a tenth,
-#: of half as many by 14 %, of twice as many by 7 %.
-FEW_DRAWS = 50.0
 
 
 @dataclass(frozen=True)
@@ -199,7 +196,6 @@ class Estimate:
         log_bayes_factor: Log Bayes factor of the effect alone against the bare model.
         mean: Mean of phi given the effect alone, shape (phi_dim,).
         sd: Standard deviation of phi given the effect alone, shape (phi_dim,).
-        effective_sample_size: Effective number of draws behind its evidence.
         engine: Engine that gave its evidence.
     """
 
@@ -211,7 +207,6 @@ class Estimate:
     log_bayes_factor: float
     mean: Array
     sd: Array
-    effective_sample_size: float
     engine: str
 
 

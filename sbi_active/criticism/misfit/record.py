@@ -238,7 +238,6 @@ def _estimates(found: Verdict, evidences: dict[str, Evidence]) -> tuple[Estimate
             log_bayes_factor=own.log_evidence - bare,
             mean=center,
             sd=phi.std(0),
-            effective_sample_size=own.effective_sample_size,
             engine=own.engine,
         )
         estimates.append(estimate)

@@ -29,7 +29,7 @@ from sbi_active.criticism.report.words import (
     verdict_in_words,
     with_error,
 )
-from sbi_active.criticism.results import FEW_DRAWS, NONE, ModelKey
+from sbi_active.criticism.results import NONE, ModelKey
 from sbi_active.criticism.steps.detection import LEVEL
 from sbi_active.display.page import Page, Picture, Section
 from sbi_active.display.table import Table
@@ -94,13 +94,10 @@ def _parameters(report: Contents) -> Table:
     """Return parameters of the bare model, and of the verdict's where it has more."""
     tracing, num = report.tracing, 1 + (report.verdict != NONE)
     units = {e.name: f" [{e.units}]" for e in tracing.estimates if e.units}
-    models = [tracing.evidences.get(name) for name in (NONE, tracing.model)]
-    draws = [inf if e is None else e.effective_sample_size for e in models]
     rows = []
     for name, *values in report.parameters.to_numpy():
-        pairs = zip(values[::2], values[1::2], draws, strict=True)
-        each = [with_error(mean, sd, of) for mean, sd, of in pairs]
-        rows.append((name + units.get(name, ""), *each[:num]))
+        each = map(with_error, values[::2], values[1::2])
+        rows.append((name + units.get(name, ""), *[*each][:num]))
     header = ["parameter", "bare model", f"with {added(report)}"]
     return Table(header[: 1 + num], rows)
 
@@ -128,23 +125,20 @@ def _effects(report: Contents) -> Table:
     rows = []
     for name in (name for name in tracing.probabilities if name not in small):
         p, e = tracing.probabilities[name], estimates.get(name)
-        evidence, phi, gain, fit = tracing.evidences.get(name), "", -inf, ["", ""]
+        evidence, phi, gain, factor = tracing.evidences.get(name), "", -inf, ""
         if e is not None:
-            pairs = zip(e.mean, e.sd, strict=True)
-            each = [with_error(m, sd, e.effective_sample_size) for m, sd in pairs]
-            phi = f"{', '.join(each)} {e.units}".strip()
+            phi = f"{', '.join(map(with_error, e.mean, e.sd))} {e.units}".strip()
         if evidence is not None:
             gain = evidence.log_evidence - null
-            draws = f"{evidence.effective_sample_size:.0f}"
-            fit = [f"{round(gain, 1) + 0.0:.1f}", draws]
+            factor = f"{round(gain, 1) + 0.0:.1f}"
         any_set = probability(tracing.inclusion.get(name, p)) if e else ""
         inside = "yes" if name in tracing.credible_set else ""
         cells = [label(tracing, name), *[probability(p)] * has_p, *[any_set] * has_sets]
-        cells += [phi, *fit, *[inside] * has_p]
+        cells += [phi, factor, *[inside] * has_p]
         rows.append((-p if has_p else 0.0, -gain, cells))
     rows.sort(key=lambda row: row[:2])
     header = ["model", *["P"] * has_p, *["P in any set"] * has_sets, "phi", "log BF"]
-    return Table([*header, "ESS", *["90 % set"] * has_p], [cells for *_, cells in rows])
+    return Table([*header, *["90 % set"] * has_p], [cells for *_, cells in rows])
 
 
 def _by_trial(report: Contents) -> Table:
@@ -218,7 +212,6 @@ def _prose(report: Contents, *, sections: bool = True) -> list[str]:
     if misfit is not None:
         refuted = tracing.instead_of if tracing.refuted else ""
         helpful = str(ModelKey(misfit.helps)) if misfit.helps else refuted
-    models = [tracing.evidences.get(n) for n in (NONE, tracing.model)]
     gain = np.zeros(1) if plan is None else plan.information_gain
     values: dict[str, Any] = {
         "verdict": verdict_in_words(report),
@@ -250,8 +243,6 @@ def _prose(report: Contents, *, sections: bool = True) -> list[str]:
         "not_shown": len(table) - len(shown(report)),
         "several": by_channel(report.residuals.x, report.residuals).shape[2] > 1,
         "metrics": METRICS,
-        "fewest": FEW_DRAWS,
-        "few_draws": any(e and e.effective_sample_size < FEW_DRAWS for e in models),
         "moves": _moves(report),
         "most_told": float(np.nanmax(gain, initial=0.0)),
         **_sizes_left(report),

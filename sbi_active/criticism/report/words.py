@@ -16,7 +16,6 @@ from sbi_active.criticism.effects.effect import Effect
 from sbi_active.criticism.forces.library import COUPLING, FAMILY
 from sbi_active.criticism.report.contents import Contents
 from sbi_active.criticism.results import (
-    FEW_DRAWS,
     NONE,
     OUTLIER,
     SCATTER,
@@ -74,29 +73,23 @@ def number(value: float) -> str:
     return f"{value:.0f}" if 1e3 <= abs(value) < 1e6 else f"{value:.3g}"
 
 
-def with_error(mean: float, sd: float, draws: float = np.inf) -> str:
+def with_error(mean: float, sd: float) -> str:
     """Return a mean to the second digit of its deviation; nothing for NaN.
 
-    A mean that is known better than that has six digits, and one with few draws behind
-    it no deviation.
+    A mean that is known better than that has six digits.
 
     Args:
         mean: Mean of the draws.
         sd: Standard deviation of the draws.
-        draws: Effective number of the draws.
 
     Example:
         >>> with_error(0.35992, 0.00071), with_error(1234.5, 56.7)
         ('0.35992 +- 0.00071', '1234 +- 57')
-        >>> with_error(159.873313255, 2.8e-14), with_error(0.35992, 0.00071, 3)
-        ('159.873 +- 2.8e-14', 'about 0.36')
-        >>> with_error(-0.003, 1.9)
-        '0.0 +- 1.9'
+        >>> with_error(159.873313255, 2.8e-14), with_error(-0.003, 1.9)
+        ('159.873 +- 2.8e-14', '0.0 +- 1.9')
     """
     if np.isnan(mean):
         return ""
-    if draws < FEW_DRAWS:
-        return f"about {mean:.2g}"
     size = abs(mean) + sd
     if not (sd > 0 and 1e-4 <= size < 1e6):  # powers of ten, or no deviation
         return f"{mean:.4g} +- {sd:.2g}"
@@ -265,7 +258,6 @@ def cautions(
         correlation=_correlation(own),
         missed=() if report.evaluation is None else report.evaluation.missed,
         infinity=np.inf,
-        weak=_weak(tracing),
         refuted=REFUTED,
         too_small=TOO_SMALL,
         edge=_at_edge(tracing, getattr(report.prior, "effects", ())),
@@ -288,18 +280,6 @@ def _disagreeing(own: Residuals) -> list[str]:
         f"trial{'s' * (len(which) > 1)} {', '.join(map(own.called, which))} {what}"
         for which, what in zip(surprising_outcomes(own), kinds, strict=True)
         if which
-    ]
-
-
-def _weak(tracing: Tracing, *, unsure: float = 0.5) -> list[str]:
-    """Return the models that count whose evidence is known to few draws or digits."""
-    counts = {n for n, p in tracing.probabilities.items() if p > 0.01}
-    return [
-        f"{e.name} ({e.effective_sample_size:.0f} effective samples, {e.engine}, "
-        f"+- {e.standard_error:.2g} nats)"
-        for name, e in tracing.evidences.items()
-        if name in {NONE, tracing.model, *counts}
-        and (e.effective_sample_size < FEW_DRAWS or e.standard_error > unsure)
     ]
 
 

@@ -52,7 +52,6 @@ def estimate(name: str, probability: float, **changes) -> Estimate:
         log_bayes_factor=9.4,
         mean=np.array([0.123]),
         sd=np.array([0.011]),
-        effective_sample_size=312.0,
         engine="least squares",
     )
     return replace(made, **changes)

@@ -59,7 +59,7 @@ def test_estimates_are_those_of_each_effect_alone():
     for estimate in tracing.estimates:
         mean, covariance = posterior(x, (estimate.name,))
         sd = covariance[-1, -1] ** 0.5
-        error = 4 * sd * np.sqrt(1 / 400 + 1 / estimate.effective_sample_size)
+        error = 4 * sd * np.sqrt(2 / 400)
         if found.misses(ModelKey((estimate.name,))):
             assert abs(estimate.mean - mean[-1]) < estimate.sd
             assert estimate.sd > 2 * sd
