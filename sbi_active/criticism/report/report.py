@@ -13,10 +13,10 @@ from sbi_active.criticism.data.trials import Trials
 from sbi_active.criticism.misfit.evaluation import evaluate_held_out
 from sbi_active.criticism.next_action import severe_tests
 from sbi_active.criticism.report.contents import Contents
-from sbi_active.criticism.report.figures import figures
 from sbi_active.criticism.report.gate import Gate, gate_of
 from sbi_active.criticism.report.sections import (
     cautions_with_codes,
+    figures,
     head,
     page,
     tables_of,

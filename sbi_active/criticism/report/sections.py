@@ -5,13 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from functools import partial
 from math import inf, isnan
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from sbi_active.criticism.contradictions import Misfit
 from sbi_active.criticism.report.contents import Contents, by_channel, root_mean_square
-from sbi_active.criticism.report.figures import CAPTIONS, METRICS
 from sbi_active.criticism.report.words import (
     NO_PART,
     added,
@@ -32,8 +31,53 @@ from sbi_active.criticism.report.words import (
 from sbi_active.criticism.results import NONE, ModelKey
 from sbi_active.criticism.steps.detection import LEVEL
 from sbi_active.display.page import Page, Picture, Section
+from sbi_active.display.panels import plot_residuals, plot_scores
 from sbi_active.display.table import Table
 from sbi_active.messages import Message, place
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+METRICS = {
+    "rmse": "RMSE",
+    "energy score": "energy score",
+    "log predictive density": "log predictive density [nats]",
+    "coverage": "share inside the central 90 %",
+}
+CAPTIONS = {
+    "residuals": "Residuals of the models refitted to all trials, in standard "
+    "deviations of the prediction; the band is two of them. Each row has its scale, "
+    "logarithmic beyond the band where residuals are large.",
+    "before_after": "One line a scored trial; the bars are over all of them. Lower is "
+    "better for the first two, higher for the third; the dotted line is 90 %.",
+}
+
+
+def figures(report: Contents) -> dict[str, Figure]:
+    """Return the report's figures by name."""
+    rows, scored = {"bare model": report.residuals}, report.evaluation
+    if report.residuals_after is not None:
+        rows[f"with {added(report)}"] = report.residuals_after
+    labels = () if report.action_is_label else report.action_labels
+    found = {
+        "residuals": plot_residuals(
+            rows, action_labels=labels, channel_names=report.channel_names
+        )
+    }
+    if scored is not None:
+        total = scored.table.set_index("metric")[["before", "after"]]
+        scores = {
+            METRICS[name]: (
+                np.stack([scored.before[name], scored.after[name]]),
+                total.loc[name].to_numpy(),
+            )
+            for name in METRICS
+        }
+        rmse, energy, _, coverage = scores
+        found["before_after"] = plot_scores(
+            scores, errors=(rmse, energy), levels={coverage: 0.9}
+        )
+    return found
 
 
 def shown(report: Contents) -> list[dict[str, Any]]:
