@@ -102,9 +102,6 @@ def suggested_sampling(trials: Trials, residuals: Any, times: Any = None) -> Sam
             NaN where nothing was measured.
         times: Sample times, shape (k,) or (n, k), where the trials have none.
 
-    Raises:
-        ValueError: If there are no sample times, or shapes differ.
-
     References:
         Ljung, System Identification, 2nd edition, 1999, section 16.6: residuals that
         are not white.
@@ -118,11 +115,6 @@ def suggested_sampling(trials: Trials, residuals: Any, times: Any = None) -> Sam
         True
     """
     r = np.asarray(residuals, dtype=float)
-    if r.shape != tuple(trials.x.shape):
-        raise ValueError(
-            f"expected residuals of the shape of x, {tuple(trials.x.shape)}; got "
-            f"{r.shape}; pass what the fitted model leaves of each number"
-        )
     n, k = r.shape[:2]
     r = r.reshape(n, k, -1)
     size = np.sqrt(np.nanmean(r**2, axis=(0, 1)))
@@ -167,8 +159,6 @@ def thinned(trials: Trials, sampling: Sampling, times: Any = None) -> Trials:
         times: Sample times, as in :func:`suggested_sampling`.
     """
     found = trials.select(slice(None))
-    if sampling.every == 1:
-        return found
     n, k = trials.x.shape[:2]
     stamps = _stamps(trials, times)
     x = found.x.reshape(n, k, -1)
@@ -190,11 +180,6 @@ def thinned(trials: Trials, sampling: Sampling, times: Any = None) -> Trials:
 def _stamps(trials: Trials, times: Any) -> Array:
     """Return sample times, shape (n, k)."""
     stamps = trials.sample_times if times is None else times
-    if stamps is None:
-        raise ValueError(
-            "expected sample times of trajectories; got none; pass Trials(sample_times="
-            "...) or times="
-        )
     return np.broadcast_to(np.asarray(stamps, dtype=float), trials.x.shape[:2])
 
 
