@@ -16,7 +16,7 @@ from torch import Tensor
 from benchmarks.criticism.cases import Case
 from benchmarks.fitting import local_fits
 from sbi_active.criticism import Report, joint_prior
-from sbi_active.criticism.under_misfit import UNDECLARED
+from sbi_active.criticism.contradictions import UNDECLARED
 from sbi_active.seeding import derive_seed
 
 NUM_DRAWS = 2_000

@@ -13,7 +13,7 @@ from benchmarks.criticism.cases import SUPPORTED
 from benchmarks.criticism.intervals import brier_score, rate, reliability
 from benchmarks.criticism.worlds import World, get_world
 from benchmarks.rows import column, grouped
-from sbi_active.criticism.under_misfit import UNDECLARED
+from sbi_active.criticism.contradictions import UNDECLARED
 
 Row = Mapping[str, str]
 #: Of lambda, residual sum of squares in units of the noise.

@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
 from sbi_active.criticism import Trials
-from sbi_active.criticism.evidence.rival_set import RivalSet
 from sbi_active.criticism.results import SCATTER, UNEXPLAINED, ModelKey
-from sbi_active.criticism.rivals.noise_grid import declared_noise
+from sbi_active.criticism.rivals.error_models import declared_noise
 from sbi_active.criticism.rivals.residual_process import ResidualProcess
+from sbi_active.criticism.rivals.rival_set import RivalSet
 from sbi_active.criticism.rivals.trial_simulator import TrialSimulator
 from sbi_active.tasks.ball_drops.data import Drop  # pyright: ignore
 from sbi_active.tasks.ball_drops.model import GRAVITY  # pyright: ignore

@@ -27,7 +27,6 @@ FURTHER = {
     "criticism": {
         "sbi_active.criticism.results": (),
         "sbi_active.criticism.contradictions": ("SevereTest",),
-        "sbi_active.criticism.effects.first_samples": ("zero_from_first_samples",),
     },
     "design": {
         "sbi_active.export": ("to_inference_data",),

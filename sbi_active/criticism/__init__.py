@@ -9,9 +9,8 @@ from sbi_active.criticism.data.trials import Trials
 from sbi_active.criticism.effects.augmented import AugmentedSimulator
 from sbi_active.criticism.effects.effect import Context, Effect
 from sbi_active.criticism.effects.first_samples import start_from_first_samples
-from sbi_active.criticism.effects.generic import generic_effects
+from sbi_active.criticism.effects.generic import generic_effects, varying_parameters
 from sbi_active.criticism.effects.joint_prior import joint_prior
-from sbi_active.criticism.effects.varying import varying_parameters
 from sbi_active.criticism.identification.identify import identify
 from sbi_active.criticism.loop import close_loop
 from sbi_active.criticism.report.report import Report

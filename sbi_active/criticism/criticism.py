@@ -18,19 +18,22 @@ from sbi_active.criticism.checks import (
     with_noise,
 )
 from sbi_active.criticism.contradictions import OutlyingTrial
-from sbi_active.criticism.data.sampling import Sampling
 from sbi_active.criticism.data.trials import Trials
 from sbi_active.criticism.effects.augmented import AugmentedSimulator
 from sbi_active.criticism.effects.effect import Effect
 from sbi_active.criticism.effects.joint_prior import joint_prior
-from sbi_active.criticism.evidence.rival_set import RivalSet
-from sbi_active.criticism.linear.screening import linear_models, thinned_to_need
+from sbi_active.criticism.effects.trial_conditions import with_known_inputs
+from sbi_active.criticism.linear.screening import (
+    Sampling,
+    linear_models,
+    thinned_to_need,
+)
 from sbi_active.criticism.misfit.contrary import judged
 from sbi_active.criticism.misfit.evaluation import evaluate_held_out, evaluate_left_out
 from sbi_active.criticism.misfit.record import traced
 from sbi_active.criticism.misfit.rule import Rule
 from sbi_active.criticism.misfit.verdict import Verdict, judge
-from sbi_active.criticism.next_trial.next_action import choose_action
+from sbi_active.criticism.next_action import choose_action
 from sbi_active.criticism.results import (
     Detection,
     Evaluation,
@@ -38,7 +41,7 @@ from sbi_active.criticism.results import (
     Residuals,
     Tracing,
 )
-from sbi_active.criticism.rivals.further_trials import with_known_inputs
+from sbi_active.criticism.rivals.rival_set import RivalSet
 from sbi_active.criticism.steps.equivalence import equivalent_effects, is_large
 from sbi_active.criticism.steps.predictive import NUM_DRAWS, find_residuals
 from sbi_active.expected import suggests
@@ -221,12 +224,11 @@ class Criticism:
 
     @cached_property
     def _traced(self) -> tuple[Tracing, RivalSet]:
-        found, large = self._verdict, self._is_large
+        found = self._verdict
         # Each model's held-out errors would take as much as the verdict.
-        held_out = None if large else self._parts[1].held_out
+        held_out = None if self._is_large else self._parts[1].held_out
         with stage("verdict, sets of effects fitted", show_progress=self.show_progress):
-            actions = None if large else self.actions  # the next action looks for more
-            tracing, models = traced(found, held_out, actions=actions, near=not large)
+            tracing, models = traced(found, held_out)
         return replace(tracing, set_aside=self.set_aside), models
 
     def add(

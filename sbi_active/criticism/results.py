@@ -8,16 +8,17 @@ from typing import Literal
 import pandas as pd
 
 from sbi_active.arrays import Array
-from sbi_active.criticism.contradictions import Bounds, MissedTrial, OutlyingTrial
-from sbi_active.criticism.under_misfit import Misfit
+from sbi_active.criticism.contradictions import (
+    Bounds,
+    Misfit,
+    MissedTrial,
+    OutlyingTrial,
+)
 
 #: What is no effect: the bare model, the residual process, noise inflation, and a gross
 #: error of one trial.
 NONE, UNEXPLAINED, SCATTER, OUTLIER = "none", "unexplained", "scatter", "outlier"
 CATCH_ALLS = (UNEXPLAINED, SCATTER, OUTLIER)
-#: Effective draws below which a deviation is none to print: of 50 it is off by a tenth,
-#: of half as many by 14 %, of twice as many by 7 %.
-FEW_DRAWS = 50.0
 
 
 @dataclass(frozen=True)
@@ -195,7 +196,6 @@ class Estimate:
         log_bayes_factor: Log Bayes factor of the effect alone against the bare model.
         mean: Mean of phi given the effect alone, shape (phi_dim,).
         sd: Standard deviation of phi given the effect alone, shape (phi_dim,).
-        effective_sample_size: Effective number of draws behind its evidence.
         engine: Engine that gave its evidence.
     """
 
@@ -207,7 +207,6 @@ class Estimate:
     log_bayes_factor: float
     mean: Array
     sd: Array
-    effective_sample_size: float
     engine: str
 
 
@@ -227,14 +226,13 @@ class Tracing:
             probable first.
         equivalent: Groups of names that no permitted action separates ("none" for an
             effect that shows nowhere).
-        near: Groups for the trials at hand alone; another action may separate them.
         aliases: After an alarm, pairs of an effect of the verdict and one that explains
             the data about as well (log evidence within log 20 of the best) with
-            predictions closer than the noise; repeated trials may separate them.
+            predictions of the trials closer than the noise; another action, or repeated
+            trials, may separate them.
         estimates: Estimates, one an effect, most probable first.
         evidences: Evidence of every model tried, by name. Priors of effects have
             unknown scale.
-        robust: Whether effect priors a third and three times as wide agree.
         guesses: Formula effects, best first: (formula, log evidence above
             "unexplained"), which is empty unless nothing declared explains the data.
         beside: Effects that explain most of what is "unexplained", the residual process
@@ -269,10 +267,8 @@ class Tracing:
     inclusion: dict[str, float]
     credible_set: tuple[str, ...]
     equivalent: tuple[frozenset[str], ...]
-    near: tuple[frozenset[str], ...]
     estimates: tuple[Estimate, ...]
     evidences: dict[str, Evidence]
-    robust: bool
     guesses: tuple[tuple[str, float], ...] = ()
     beside: tuple[str, ...] = ()
     outliers: dict[float, float] = field(default_factory=dict)

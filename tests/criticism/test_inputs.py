@@ -18,7 +18,7 @@ from sbi_active.criticism import (
     close_loop,
     generic_effects,
 )
-from sbi_active.criticism.report.figures import figures
+from sbi_active.criticism.report.sections import figures
 from sbi_active.criticism.rivals.trial_simulator import TrialSimulator
 from tests.criticism.motor_world import LIBRARY, MODEL, PRIOR, measured
 from tests.effects import on_outcomes

@@ -10,8 +10,8 @@ from torch.distributions import Independent, MultivariateNormal, Normal
 
 from sbi_active import DiscreteActions, GaussianNoise, SimulatorModel
 from sbi_active.criticism import AugmentedSimulator, Criticism, Trials
-from sbi_active.criticism.evidence.rival_set import RivalSet
 from sbi_active.criticism.rivals.rival import DISAGREEMENT
+from sbi_active.criticism.rivals.rival_set import RivalSet
 from sbi_active.criticism.rivals.trial_simulator import NUM_REPLICATES, TrialSimulator
 from sbi_active.criticism.steps.predictive import predict
 from tests.effects import effect

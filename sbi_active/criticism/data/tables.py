@@ -55,8 +55,7 @@ def read_trials(
     have its name as a prefix; if a row is a trial, rows are numbered on from file to
     file.
 
-    Warns of cells without a number, and of trials whose numbers are so much larger than
-    the others' that they may be in another unit.
+    Warns of cells without a number.
 
     Args:
         table: Path of a CSV file or of a folder, or a data frame.
@@ -210,7 +209,6 @@ def arguments_of(cells: Cells, beside: Cells | None = None) -> dict[str, Any]:
     }
     if beside is not None or columns["input"]:
         found |= _inputs(beside or cells, cells.names)
-    _note_scales(cells, action, samples)
     for column in columns["role"]:
         roles = cells.words(column)
         is_role = np.isin(roles.astype(str), ("", "fit", "held out", "held_out"))
@@ -320,44 +318,3 @@ def _require_distinct(
         one = seen.setdefault(told.tobytes(), t) if is_told else t
         got = f"the same numbers in trials {cells.names[one]} and {cells.names[t]}"
         require(one == t, "each trial once", f"{got} of {cells.source}", AGAIN)
-
-
-def _note_scales(cells: Cells, action: Array, samples: Sequence[Array]) -> None:
-    """Warn of columns that may be in another unit in some trials."""
-    for column, own in zip(cells.columns["action"], action.T, strict=True):
-        _note_scale(cells, np.abs(own)[:, None], column.header)
-    if cells.is_long:
-        steps = [np.diff(each[:, 0]) for each in samples]
-        _note_scale(cells, steps, cells.columns[TIME][0].header)
-        for j, column in enumerate(cells.columns["x"], 1):
-            _note_scale(cells, [np.abs(s[:, j]) for s in samples], column.header)
-
-
-def _note_scale(
-    cells: Cells,
-    sizes: Sequence[Array] | Array,
-    header: str,
-    *,
-    # Decades between the sizes of two groups of trials that look like two units, and
-    # those within each.
-    gap: float = 1.7,
-    within: float = 1.0,
-) -> None:
-    """Warn where some trials' numbers are larger by as much as another unit."""
-    middle = [np.nanmedian(s) if np.isfinite(s).any() else 0 for s in sizes]
-    known: Any = pd.Series(middle, cells.names)
-    decades = known[known > 0].map(np.log10).sort_values(kind="stable")
-    if len(decades) < 3:
-        return
-    k = int(np.argmax(np.diff(decades))) + 1
-    low, high = decades[:k], decades[k:]
-    if high.min() - low.max() < gap or max(map(np.ptp, (low, high))) > within:
-        return
-    fewer, word = (low, "smaller") if len(low) < len(high) else (high, "larger")
-    which = ", ".join([name for name in cells.names if name in fewer.index][:SHOWN])
-    factor = 10 ** (high.median() - low.median())
-    warn(
-        f"SA207 {header} of {'trials' if cells.is_named else 'rows'} {which} in "
-        f"{cells.source} is about {factor:.0f} times {word} than that of the others: "
-        "check that all are in one unit",
-    )

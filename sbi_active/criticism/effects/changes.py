@@ -6,7 +6,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -20,13 +19,12 @@ class Wrapped:
     Attributes:
         what: Name of the change in :data:`CHANGES`.
         inputs: Names of the inputs that it changes alike; () changes the value itself.
-        channel: Entry of x's last axis that alone is changed, or several with a phi
-            each; None changes all.
+        channel: Entry of x's last axis that alone is changed; None changes all.
     """
 
     what: str
     inputs: tuple[str, ...] = ()
-    channel: int | tuple[int, ...] | None = None
+    channel: int | None = None
 
     def __call__(
         self, value: Any, phi: Tensor, action: Tensor, context: Context
@@ -37,9 +35,8 @@ class Wrapped:
             return {**value, **{n: change(value[n], phi, context) for n in self.inputs}}
         if self.channel is None:
             return change(value, phi, context)
-        parts, channels = [*value.split(1, -1)], np.atleast_1d(self.channel)
-        for own, channel in zip(phi.split(1, -1), channels, strict=True):
-            parts[channel] = change(parts[channel], own, context)
+        parts = [*value.split(1, -1)]
+        parts[self.channel] = change(parts[self.channel], phi, context)
         return torch.cat(parts, -1)
 
 

@@ -29,8 +29,7 @@ from torch.distributions import Independent, Normal
 from sbi_active.arrays import Array
 from sbi_active.criticism.data.arrays import repeated
 from sbi_active.criticism.data.trials import Trials
-from sbi_active.criticism.effects.changes import Wrapped
-from sbi_active.criticism.effects.effect import Context, Effect, Hook
+from sbi_active.criticism.effects.effect import Context, Effect
 from sbi_active.expected import require
 from sbi_active.messages import warn
 
@@ -111,53 +110,10 @@ def start_from_first_samples(
     shown = dict(zip(start, torch.from_numpy(values.T.copy()), strict=True))
     copy.start = {**known, **shown}
     copy.repeat_of = repeated(copy.settings())
-    return copy, _nuisance(name, "dynamics", _Shifted((*start,)), width * errors)
-
-
-def zero_from_first_samples(
-    trials: Trials,
-    *,
-    within: float,
-    sd: float | Sequence[float],
-    channels: Sequence[int] = (0,),
-    width: float = WIDTH,
-    name: str = "zero",
-) -> tuple[Trials, Effect]:
-    """Return the trials less the mean of their first samples, and what is left of it.
-
-    Use it for a sensor whose zero differs from trial to trial and shows before anything
-    moves, as that of a load cell.
-
-    Args:
-        trials: Trials with sample times.
-        within: Time from its first sample in which a trial is at rest, in the unit of
-            the sample times.
-        sd: Standard deviation of the sensor, one for all entries of x or one each.
-        channels: Entries of x's last axis that have such a zero.
-        width: Standard errors in a deviation of the nuisance.
-        name: Name of the nuisance.
-
-    Returns:
-        A copy of the trials with other x, and an effect of scope "trial" with an entry
-        of phi for each channel.
-
-    Raises:
-        ValueError: If :func:`start_from_first_samples` would raise it.
-
-    Example:
-        >>> force = torch.tensor([[125.0, 125.0, 131.0], [90.0, 90.0, 97.0]])
-        >>> trials = Trials([1.0, 2.0], force, sample_times=[0.0, 0.1, 0.2])
-        >>> trials, nuisance = zero_from_first_samples(trials, within=0.15, sd=1.0)
-        >>> trials.x.tolist()
-        [[0.0, 0.0, 6.0], [0.0, 0.0, 7.0]]
-    """
-    each = [(channel, 0) for channel in channels]
-    values, errors, _ = _fitted(trials, each, 0, within, sd)
-    copy = trials.select(slice(None))
-    offset = Wrapped("offset", channel=None if copy.x.ndim == 2 else (*channels,))
-    zero = torch.from_numpy(-values).to(copy.x.dtype)
-    copy.x = offset(copy.x, zero, copy.action, Context(copy.index))
-    return copy, _nuisance(name, "observation", offset, width * errors)
+    scale = torch.from_numpy(width * errors.max(0))  # of the trial that tells least
+    prior = Independent(Normal(torch.zeros_like(scale), scale), 1)
+    shifted, own = _Shifted((*start,)), {"prior": prior, "scope": "trial"}
+    return copy, Effect(name, hook="dynamics", null=0.0, apply=shifted, **own)
 
 
 @dataclass(frozen=True)
@@ -174,13 +130,6 @@ class _Shifted:
             return value
         own = dict(zip(self.names, phi.unbind(-1), strict=True))
         return {**value, "start": {k: v + own.get(k, 0) for k, v in start.items()}}
-
-
-def _nuisance(name: str, hook: Hook, apply: Any, deviations: Array) -> Effect:
-    """Return the nuisance of a trial, as wide as in the trial that tells least."""
-    scale = torch.from_numpy(deviations.max(0))
-    prior = Independent(Normal(torch.zeros_like(scale), scale), 1)
-    return Effect(name, hook=hook, prior=prior, null=0.0, apply=apply, scope="trial")
 
 
 def _fitted(

@@ -1,4 +1,4 @@
-"""Conditions of trials, as effects and simulators get them."""
+"""Conditions of trials that were run, and of those at other actions."""
 
 from __future__ import annotations
 
@@ -7,7 +7,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from sbi_active.actions import ActionSpace, DiscreteActions
 from sbi_active.criticism.data.arrays import rows_at
+from sbi_active.criticism.data.input_series import held_at
 from sbi_active.criticism.data.trials import Trials
 from sbi_active.criticism.effects.effect import Context
 from sbi_active.simulation import SimulatorModel
@@ -63,3 +65,131 @@ def _held(times: Tensor) -> Tensor:
     last = times.nan_to_num(-torch.inf).amax(-1, keepdim=True)
     last = last.where(last.isfinite(), torch.zeros_like(last))
     return times.where(times.isfinite(), last)
+
+
+def with_known_inputs(
+    model: SimulatorModel, trials: Trials, actions: ActionSpace
+) -> ActionSpace:
+    """Return the permitted actions that could be simulated.
+
+    If inputs over time were recorded and the model has no signals, the inputs at
+    another action are not known: only actions of recorded trials remain, with their
+    inputs.
+
+    Args:
+        model: The simulator.
+        trials: Measured trials.
+        actions: The permitted ones.
+    """
+    if trials.inputs is None or model.inputs is not None:
+        return actions
+    recorded = trials.action.unique(dim=0)
+    kept = recorded[actions.contains(recorded.float())]
+    return DiscreteActions(
+        kept if len(kept) else recorded, names=actions.names, units=actions.units
+    )
+
+
+def are_known(model: SimulatorModel, trials: Trials, action: Tensor) -> Tensor:
+    """Return at which actions, shape (a, action_dim), trials can be simulated, (a,)."""
+    if trials.inputs is None or model.inputs is not None:
+        return torch.ones(len(action), dtype=torch.bool)
+    return _same(trials, action).any(1)
+
+
+def conditions_at(
+    model: SimulatorModel, trials: Trials, action: Tensor
+) -> dict[str, Any]:
+    """Return conditions of trials at some actions, as arguments of ``Trials``.
+
+    Inputs and start state are those of the first trial of the action; at an action that
+    none has, inputs are the model's signals and the start is the mean of those
+    measured.
+
+    Args:
+        model: The simulator.
+        trials: Measured trials.
+        action: Actions, shape (a, action_dim).
+
+    Raises:
+        ValueError: If inputs were recorded, and none at some of these actions.
+    """
+    if trials.inputs is None and trials.start is None:
+        return {}
+    same = _same(trials, action)
+    found = same.any(1)
+    first = same.int().argmax(1)
+    inputs = rows_at(trials.inputs, first)
+    if inputs is not None and model.inputs is not None:
+        inputs = _signals(model, trials, action, inputs, found)
+    elif inputs is not None and not bool(found.all()):
+        i = int((~found).nonzero()[0])
+        raise ValueError(
+            "expected actions whose inputs were recorded; got "
+            f"{action[i].tolist()}; permit actions of the trials alone"
+        )
+    return {
+        "inputs": inputs,
+        "input_times": trials.input_times,
+        "start": _starts(trials.start, first, found),
+    }
+
+
+def unmeasured(
+    model: SimulatorModel, trials: Trials, action: Tensor, index: Tensor
+) -> Trials:
+    """Return trials at some actions, with all numbers that any trial has.
+
+    Args:
+        model: The simulator.
+        trials: Measured trials.
+        action: Actions, shape (a, action_dim).
+        index: Place of each trial in the order of execution, shape (a,).
+    """
+    x, times = trials.template()
+    found = Trials(
+        action.double(),
+        x.expand(len(action), *x.shape),
+        index=index,
+        sample_times=times,
+        **conditions_at(model, trials, action),
+    )
+    found.action_is_label = trials.action_is_label
+    return found
+
+
+def _signals(
+    model: SimulatorModel,
+    trials: Trials,
+    action: Tensor,
+    recorded: dict[str, Tensor],
+    found: Tensor,
+) -> dict[str, Tensor]:
+    """Return recorded inputs where there are some, and signals on their grid."""
+    assert model.inputs is not None
+    assert trials.input_times is not None
+    signals = model.inputs.inputs(action.double())
+    if {*signals} != {*recorded}:
+        raise ValueError(
+            f"expected trials with the inputs of the model's signals, "
+            f"{', '.join(signals)}; got {', '.join(recorded)}; name them alike"
+        )
+    played = held_at(signals, model.inputs.input_times, trials.input_times)
+    known = found[:, None]
+    return {name: recorded[name].where(known, played[name]) for name in recorded}
+
+
+def _same(trials: Trials, action: Tensor) -> Tensor:
+    """Return a mask of the trials that have each action, shape (a, t)."""
+    own, asked = trials.action.double(), action.double()
+    # As far as single precision tells.
+    return torch.isclose(asked[:, None], own[None], rtol=1e-5, atol=1e-7).all(-1)
+
+
+def _starts(start: Any, first: Tensor, found: Tensor) -> Any:
+    if isinstance(start, dict):
+        return {name: _starts(part, first, found) for name, part in start.items()}
+    if start is None:
+        return None
+    known = found.reshape(-1, *[1] * (start.ndim - 1))
+    return start[first].where(known, start.mean(0))

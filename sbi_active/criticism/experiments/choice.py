@@ -14,7 +14,7 @@ from scipy.spatial.distance import cdist
 from scipy.special import gammaln
 
 from sbi_active.criticism.criticism import Criticism
-from sbi_active.criticism.next_trial.next_action import following
+from sbi_active.criticism.next_action import following
 from sbi_active.criticism.report.contents import Registered, TestedTrial
 from sbi_active.criticism.report.report import Report
 from sbi_active.criticism.results import NONE, UNEXPLAINED, Array, ModelKey

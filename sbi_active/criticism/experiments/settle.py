@@ -17,6 +17,7 @@ from torch import Tensor
 from sbi_active.criticism.criticism import Criticism
 from sbi_active.criticism.data.arrays import without_inf
 from sbi_active.criticism.data.trials import Trials
+from sbi_active.criticism.effects.trial_conditions import unmeasured
 from sbi_active.criticism.experiments.choice import (
     Settling,
     choose,
@@ -28,7 +29,6 @@ from sbi_active.criticism.experiments.choice import (
 from sbi_active.criticism.report.contents import Registered, TestedTrial
 from sbi_active.criticism.report.report import Report
 from sbi_active.criticism.results import Array
-from sbi_active.criticism.rivals.further_trials import unmeasured
 from sbi_active.expected import require
 from sbi_active.messages import Explained, Message
 from sbi_active.simulation import SimulatorModel

@@ -15,8 +15,12 @@ from sbi_active.criticism.data.measurements import Measurements
 from sbi_active.criticism.data.trials import Trials
 from sbi_active.criticism.effects.augmented import AugmentedSimulator
 from sbi_active.criticism.effects.effect import Effect
-from sbi_active.criticism.identification.channels import TINY, ChannelErrors
-from sbi_active.criticism.identification.posterior import Draws, Posterior
+from sbi_active.criticism.identification.posterior import (
+    TINY,
+    ChannelErrors,
+    Draws,
+    Posterior,
+)
 from sbi_active.criticism.identification.settings import IdentifySettings
 from sbi_active.criticism.linear.fits import best_fit, polished
 from sbi_active.criticism.linear.model import (

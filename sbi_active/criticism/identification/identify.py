@@ -14,10 +14,15 @@ from sbi_active.criticism.checks import require_fitting
 from sbi_active.criticism.data.trials import Trials
 from sbi_active.criticism.effects.effect import Effect
 from sbi_active.criticism.effects.trial_conditions import conditions_for
-from sbi_active.criticism.identification.bending import bends, sampled
 from sbi_active.criticism.identification.fitting import Fitted, fitted
 from sbi_active.criticism.identification.settings import IdentifySettings
-from sbi_active.criticism.identification.widening import opened, reflected, spread
+from sbi_active.criticism.identification.widening import (
+    bends,
+    opened,
+    reflected,
+    sampled,
+    spread,
+)
 from sbi_active.expected import suggests
 from sbi_active.inference.beliefs.diagnostics import Diagnostics
 from sbi_active.inference.beliefs.weighted import KernelBelief
@@ -88,7 +93,7 @@ def identify(
     own parameter (:mod:`.posterior`); fits follow where they are. Where single trials
     disagree all the same, the model lacks something else, and the belief is as wide as
     their disagreement says (:mod:`.widening`). Where the likelihood is not that of a
-    linear model, draws are of the simulator's own (:mod:`.bending`).
+    linear model, draws are of the simulator's own.
 
     Args:
         model: Simulator, deterministic but for the noise. The white part of the errors

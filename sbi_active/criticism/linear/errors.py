@@ -38,8 +38,7 @@ from sbi_active.criticism.linear.processes import (
     time_scales,
 )
 from sbi_active.criticism.results import OUTLIER, UNEXPLAINED
-from sbi_active.criticism.rivals.error_models import LOG_2PI, NoiseGrid
-from sbi_active.criticism.rivals.noise_grid import LARGEST, sizes
+from sbi_active.criticism.rivals.error_models import LARGEST, LOG_2PI, NoiseGrid, sizes
 from sbi_active.criticism.steps.predictive import is_first_part
 from sbi_active.inference.sampling.weights import log_sum_exp
 
@@ -181,7 +180,6 @@ class Errors:
         use: NDArray[np.bool_] | None = None,
         *,
         beside: bool,
-        factor: float = 1.0,
     ) -> Mixture:
         """Return the evidence and the posterior of a model.
 
@@ -191,14 +189,12 @@ class Errors:
             use: Parts of the trials that count, shape (f,); None takes all.
             beside: Whether there is a residual process beside the sensor's error, or a
                 parameter that differs from trial to trial.
-            factor: Factor on the scales of the effects' priors.
         """
         some = np.ones(self.num_folds, bool) if use is None else use
         state = UNEXPLAINED if beside else None
         gram, log_weight = self.hypotheses(model, grams, some, state)
         log_weight = log_weight + model.offset[some[self.fold]].sum()
-        widths = [factor * width for width in WIDTHS]
-        return summed(gram, log_weight, model, widths)
+        return summed(gram, log_weight, model, WIDTHS)
 
     def hypotheses(
         self,

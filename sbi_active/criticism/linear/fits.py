@@ -11,11 +11,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sbi_active.arrays import Array
-from sbi_active.criticism.evidence.rival_set import RivalSet
 from sbi_active.criticism.linear.model import LinearModel, centered, linearize
-from sbi_active.criticism.rivals.error_models import NoiseCell, NoiseGrid
-from sbi_active.criticism.rivals.noise_grid import measurement_sds
+from sbi_active.criticism.rivals.error_models import (
+    NoiseCell,
+    NoiseGrid,
+    measurement_sds,
+)
 from sbi_active.criticism.rivals.rival import Rival
+from sbi_active.criticism.rivals.rival_set import RivalSet
 from sbi_active.inference.sampling.least_squares import descend
 
 

@@ -1,31 +1,227 @@
-"""What precedes the fits: samples and effects that are left out of them.
+r"""What precedes the fits: samples and effects that are left out of them.
 
-A library of many effects is screened by the linear evidence of one Jacobian.
+Errors of a simulator are smooth, and at a high sampling rate each sample repeats the
+error of the one before. An autocorrelated error takes up some of that, and its
+innovations
+
+.. math::
+    e_k = \frac{r_k - \rho_k r_{k-1}}{\sqrt{1 - \rho_k^2}}, \qquad
+    \rho_k = e^{-\Delta t_k / \tau},
+
+with the :math:`\tau` of the largest likelihood, are independent where it takes up all.
+Where neighboring innovations are correlated, every Bayes factor counts the same motion
+several times.
 
 A fit of an effect takes a dozen simulations of the trials, its column one. With the
 bare model's best fit and a column of every effect the evidence of all singles and pairs
-is linear algebra; effects that are in none of the best are set aside.
+is linear algebra; of a library of many effects, those in none of the best are set
+aside.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from sbi_active.arrays import Array
 from sbi_active.criticism.data.measurements import Measurements
-from sbi_active.criticism.data.sampling import Sampling, suggested_sampling, thinned
 from sbi_active.criticism.data.trials import Trials
-from sbi_active.criticism.evidence.rival_set import RivalSet
 from sbi_active.criticism.linear.fits import JUMPING, FitSettings, best_fit, sensor_of
 from sbi_active.criticism.linear.library import Library
 from sbi_active.criticism.linear.model import LinearModel
 from sbi_active.criticism.linear.search import Search
 from sbi_active.criticism.results import ModelKey
-from sbi_active.criticism.rivals.noise_grid import measurement_sds
+from sbi_active.criticism.rivals.error_models import measurement_sds
+from sbi_active.criticism.rivals.rival_set import RivalSet
 from sbi_active.criticism.steps.equivalence import MANY
+
+
+@dataclass(frozen=True, kw_only=True)
+class NeedSettings:
+    """Settings of the sampling that trials need.
+
+    Attributes:
+        independent: Correlation of neighboring innovations that counts as none.
+        significant: Multiple of its standard error that counts as none.
+        fewest: Samples of the median trial that are left, at least.
+        num_times: Number of correlation times that are tried.
+        shortest: The shortest of them, in steps.
+        longest: The longest of them, in spans of the recording.
+    """
+
+    independent: float = 0.2
+    significant: float = 3.0
+    fewest: int = 8
+    num_times: int = 40
+    shortest: float = 0.2
+    longest: float = 2.0
+
+
+NEED = NeedSettings()
+
+
+@dataclass(frozen=True, kw_only=True)
+class Sampling:
+    """The sampling of trials, and the sampling that they need.
+
+    Attributes:
+        step: Median time between samples, s.
+        every: Interval of the samples to keep: every 1st, 2nd,
+        before: Largest correlation of neighboring innovations at the higher rates that
+            were looked at, of all samples where they are all kept.
+        after: Largest correlation of neighboring innovations of the samples that are
+            kept.
+    """
+
+    step: float
+    every: int
+    before: float
+    after: float
+
+    @property
+    def suggested_step(self) -> float:
+        """Time between the samples that are kept, s."""
+        return self.every * self.step
+
+
+def suggested_sampling(trials: Trials, residuals: Any, times: Any = None) -> Sampling:
+    """Return the sampling of trials, and the sampling that they need.
+
+    The needed rate is the first one, from high to low, at which neighboring innovations
+    are correlated by no more than .2, or three standard errors, after a rate at which
+    they are: at a very high rate the sensor's error hides the simulator's. All samples
+    are kept if no rate has correlated innovations. At least 8 samples of a trial are
+    left.
+
+    Args:
+        trials: Trials with sample times.
+        residuals: Residuals that a fitted model leaves, of the shape of x (n, k, ...),
+            NaN where nothing was measured.
+        times: Sample times, shape (k,) or (n, k), where the trials have none.
+
+    References:
+        Ljung, System Identification, 2nd edition, 1999, section 16.6: residuals that
+        are not white.
+
+    Example:
+        >>> import torch
+        >>> times = torch.linspace(0, 10, 400)
+        >>> x = torch.stack([(times + shift).sin() for shift in (0.0, 1.0, 2.0)])
+        >>> trials = Trials(torch.arange(3.0), x, sample_times=times)
+        >>> suggested_sampling(trials, x).every > 10
+        True
+    """
+    r = np.asarray(residuals, dtype=float)
+    n, k = r.shape[:2]
+    r = r.reshape(n, k, -1)
+    size = np.sqrt(np.nanmean(r**2, axis=(0, 1)))
+    series = (r / np.where(size > 0, size, 1.0)).transpose(0, 2, 1).reshape(-1, k)
+    stamps = np.repeat(_stamps(trials, times), r.shape[2], axis=0)
+    # Each trial and channel by its own samples, whatever others have between them.
+    order = np.argsort(~np.isfinite(series), axis=1, kind="stable")
+    series = np.take_along_axis(series, order, 1)
+    stamps = np.take_along_axis(stamps, order, 1)
+    stamps = np.where(np.isfinite(series), stamps, np.nan)
+    gaps = np.diff(stamps, axis=1)
+    step = float(np.nanmedian(gaps)) if np.isfinite(gaps).any() else 1.0
+    count = int(np.median(np.isfinite(series).sum(1)))
+    found: list[float] = []
+    is_hidden = True  # and may yet show
+    for every in range(1, max(count // NEED.fewest, 1) + 1):
+        correlation, num = _innovations(series, stamps, every)
+        found.append(correlation)
+        if not _independent(correlation, num):
+            is_hidden = False
+        elif not is_hidden:
+            break
+    every = 1 if is_hidden else len(found)
+    return Sampling(
+        step=step,
+        every=every,
+        before=found[0] if every == 1 else max(found[:-1]),
+        after=found[every - 1],
+    )
+
+
+def thinned(trials: Trials, sampling: Sampling, times: Any = None) -> Trials:
+    """Return trials of which only samples as far apart as suggested count as measured.
+
+    The others are masked, in each trial and channel by itself: times and other inputs
+    of the simulator stay as they are. The first samples, often the start that the
+    simulator is given, are masked too; a shorter trial keeps its last one.
+
+    Args:
+        trials: Trials with x of shape (n, k, ...).
+        sampling: Sampling that was found.
+        times: Sample times, as in :func:`suggested_sampling`.
+    """
+    found = trials.select(slice(None))
+    n, k = trials.x.shape[:2]
+    stamps = _stamps(trials, times)
+    x = found.x.reshape(n, k, -1)
+    for i in range(n):
+        for channel in x[i].T:
+            place = np.flatnonzero(channel.isfinite().numpy())
+            if not len(place):
+                continue
+            at, apart = stamps[i, place], sampling.suggested_step - 0.5 * sampling.step
+            kept, last = [], at[0] - sampling.step
+            while (following := np.searchsorted(at, last + apart)) < len(at):
+                kept.append(following)
+                last = at[following]
+            keep = place[kept or [-1]]
+            channel[np.setdiff1d(np.arange(k), keep)] = float("nan")
+    return found
+
+
+def _stamps(trials: Trials, times: Any) -> Array:
+    """Return sample times, shape (n, k)."""
+    stamps = trials.sample_times if times is None else times
+    return np.broadcast_to(np.asarray(stamps, dtype=float), trials.x.shape[:2])
+
+
+def _independent(correlation: float, num: int) -> bool:
+    # Differences of independent errors are correlated as well, with the other sign.
+    return correlation <= max(NEED.independent, NEED.significant / np.sqrt(max(num, 1)))
+
+
+def _innovations(series: Array, stamps: Array, every: int) -> tuple[float, int]:
+    """Return the correlation of neighboring innovations, and how many pairs there are.
+
+    Args:
+        series: Residuals, one a trial and channel, shape (s, k), NaN where missing.
+        stamps: Times of the samples, of the same shape.
+        every: Interval of the samples that are kept: every 1st, 2nd, ...
+    """
+    r, t = series[:, every - 1 :: every], stamps[:, every - 1 :: every]
+    gaps = np.diff(t, axis=1)
+    if gaps.shape[1] < 2 or not np.isfinite(gaps).any():
+        return 0.0, 0
+    step, span = np.nanmedian(gaps), np.nanmax(t) - np.nanmin(t)
+    best, chosen = -np.inf, np.zeros((len(r), 0))
+    for tau in np.geomspace(
+        NEED.shortest * step, max(NEED.longest * span, step), NEED.num_times
+    ):
+        variance = -np.expm1(-2 * gaps / tau)
+        e = (r[:, 1:] - np.exp(-gaps / tau) * r[:, :-1]) / np.sqrt(variance)
+        seen = np.isfinite(e)
+        first = r[:, :1][np.isfinite(r[:, :1])]
+        num = seen.sum() + len(first)
+        square = (e[seen] ** 2).sum() + (first**2).sum()
+        log_p = -0.5 * num * np.log(max(square / num, 1e-300))
+        log_p -= 0.5 * np.log(variance[seen]).sum()
+        if log_p > best:
+            best, chosen = log_p, e
+    one, two = chosen[:, :-1], chosen[:, 1:]
+    both = np.isfinite(one) & np.isfinite(two)
+    power = float((chosen[np.isfinite(chosen)] ** 2).mean()) if both.any() else 0.0
+    if power == 0:
+        return 0.0, 0
+    return float((one[both] * two[both]).mean() / power), int(both.sum())
+
 
 #: Effects whose pairs are compared, best alone, and effects that are fitted: with 24,
 #: verdicts and errors are those of 16, and take a half more of simulated trials.

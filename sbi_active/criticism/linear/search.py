@@ -16,7 +16,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sbi_active.arrays import Array
-from sbi_active.criticism.evidence.rival_set import RivalSet
 from sbi_active.criticism.forces.library import is_force
 from sbi_active.criticism.linear.errors import Errors
 from sbi_active.criticism.linear.fits import (
@@ -39,6 +38,7 @@ from sbi_active.criticism.linear.model import (
 from sbi_active.criticism.results import ModelKey
 from sbi_active.criticism.rivals.residual_process import ResidualProcess
 from sbi_active.criticism.rivals.rival import Rival
+from sbi_active.criticism.rivals.rival_set import RivalSet
 from sbi_active.criticism.steps.detection import log_prior, log_priors
 from sbi_active.seeding import derive_seed
 

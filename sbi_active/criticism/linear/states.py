@@ -76,7 +76,7 @@ class States:
         return {key: float(np.log(rest)), **states}
 
     def joint(
-        self, key: ModelKey, use: NDArray[np.bool_] | None = None, factor: float = 1.0
+        self, key: ModelKey, use: NDArray[np.bool_] | None = None
     ) -> dict[ModelKey, float]:
         """Return a model in each state, and the log evidence of both, nats.
 
@@ -84,10 +84,9 @@ class States:
             key: Effects on the prediction.
             use: Parts of the trials that count, shape (f,); None takes all. Of some
                 trajectories, smooth functions of the action are no state.
-            factor: Factor on the scales of effects' priors.
         """
         return {
-            own: p + self.mixture(own, use, factor).log_evidence
+            own: p + self.mixture(own, use).log_evidence
             for own, p in self.keys(key).items()
         }
 
@@ -106,25 +105,20 @@ class States:
         """Return the log evidence of a model in one state, nats."""
         return self.mixture(key).log_evidence
 
-    def mixture(
-        self, key: ModelKey, use: NDArray[np.bool_] | None = None, factor: float = 1.0
-    ) -> Mixture:
+    def mixture(self, key: ModelKey, use: NDArray[np.bool_] | None = None) -> Mixture:
         """Return the posterior of a model in one state.
 
         Args:
             key: Effects, and the state of the error.
             use: Parts of the trials that count, shape (f,); None takes all.
-            factor: Factor on the scales of effects' priors.
         """
-        if use is None and factor == 1:
-            if key not in self._known:
-                self._known[key] = self._summed(key, None, 1.0)
-            return self._known[key]
-        return self._summed(key, use, factor)
+        if use is not None:
+            return self._summed(key, use)
+        if key not in self._known:
+            self._known[key] = self._summed(key, None)
+        return self._known[key]
 
-    def _summed(
-        self, key: ModelKey, use: NDArray[np.bool_] | None, factor: float
-    ) -> Mixture:
+    def _summed(self, key: ModelKey, use: NDArray[np.bool_] | None) -> Mixture:
         c, errors = self.search.found[self.predicting(key)], self.search.errors
         some = np.ones(errors.num_folds, bool) if use is None else use
         gram, log_p = errors.hypotheses(c.model, c.grams, some, key.error)
@@ -139,12 +133,11 @@ class States:
                 gram = np.concatenate([gram, smooth[0]])
                 log_p = np.concatenate([log_p, smooth[1]])
         elif key.error is None and (louder := self.louder(key)):
-            scale = self._scales(louder, factor)[1]
+            scale = self._scales(louder)[1]
             gram, log_p = errors.scaled(c.model.rows, scale, some)
             log_p = log_p - np.log(len(scale))
         log_p = log_p + self._beside_numbers(c, key.error, some)
-        widths = [factor * width for width in WIDTHS] if key.effects else [1.0]
-        return summed(gram, log_p, c.model, widths)
+        return summed(gram, log_p, c.model, WIDTHS if key.effects else (1.0,))
 
     def _beside_numbers(
         self, c: Candidate, error: str | None, use: NDArray[np.bool_]
@@ -207,10 +200,10 @@ class States:
         num = self.num_louder
         share = self.mixture(key, use).share.reshape(-1, num).sum(0)
         drawn = rng.choice(num, size=num, p=share / share.sum())
-        phi, scale = self._scales(self.louder(key), 1.0)
+        phi, scale = self._scales(self.louder(key))
         return phi[drawn], scale[drawn]
 
-    def _scales(self, effects: Sequence[Effect], factor: float) -> tuple[Array, Array]:
+    def _scales(self, effects: Sequence[Effect]) -> tuple[Array, Array]:
         """Return draws of effects on the noise, and its factors, (n, k) and (n, N)."""
         rivals, num, parts = self.search.rivals, self.num_louder, []
         for e in effects:
@@ -219,7 +212,7 @@ class States:
             null = e.null_phi(1)
             ends = np.stack(support_bounds(support_of(e.prior), e.phi_dim))
             if bool(null.isfinite().all()) and not np.isfinite(ends).all(0).any():
-                width = torch.tensor(factor * np.resize(WIDTHS, num))
+                width = torch.tensor(np.resize(WIDTHS, num))
                 phi = null + width[:, None] * (phi - null)
             parts.append(phi)
         named = {e.name: phi for e, phi in zip(effects, parts, strict=True)}

@@ -10,9 +10,7 @@ from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from sbi_active.arrays import Array
-from sbi_active.criticism.contradictions import BoundParameter, Bounds
-from sbi_active.criticism.evidence.fit import Fit
-from sbi_active.criticism.evidence.rival_set import RivalSet
+from sbi_active.criticism.contradictions import BoundParameter, Bounds, Misfit
 from sbi_active.criticism.forces.library import is_force
 from sbi_active.criticism.misfit.verdict import Verdict
 from sbi_active.criticism.results import (
@@ -25,9 +23,10 @@ from sbi_active.criticism.results import (
     Tracing,
 )
 from sbi_active.criticism.rivals.error_models import Whitener
+from sbi_active.criticism.rivals.fit import Fit
 from sbi_active.criticism.rivals.rival import Rival
+from sbi_active.criticism.rivals.rival_set import RivalSet
 from sbi_active.criticism.steps.detection import LEVEL, THRESHOLD
-from sbi_active.criticism.under_misfit import Misfit
 from sbi_active.inference.sampling.least_squares import descend
 
 #: Score of trials that speaks against effects.

@@ -10,7 +10,6 @@ import pandas as pd
 
 from sbi_active.arrays import Array
 from sbi_active.criticism.data.trials import Trials
-from sbi_active.criticism.evidence.rival_set import RivalSet
 from sbi_active.criticism.linear.fits import sensor_of
 from sbi_active.criticism.misfit.draws import posterior
 from sbi_active.criticism.misfit.verdict import Verdict
@@ -22,6 +21,7 @@ from sbi_active.criticism.results import (
     ModelKey,
     Tracing,
 )
+from sbi_active.criticism.rivals.rival_set import RivalSet
 from sbi_active.criticism.steps.missed_trials import LEVEL, missed_trials, tails_of
 from sbi_active.criticism.steps.predictive import NUM_DRAWS, Prediction, predict
 from sbi_active.progress import stage

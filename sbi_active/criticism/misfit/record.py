@@ -9,11 +9,11 @@ from typing import Any
 
 import numpy as np
 
-from sbi_active.actions import ActionSpace
 from sbi_active.arrays import Array
+from sbi_active.criticism.contradictions import Misfit as Found
+from sbi_active.criticism.contradictions import ModelError
 from sbi_active.criticism.data.trials import Trials
-from sbi_active.criticism.evidence.rival_set import RivalSet
-from sbi_active.criticism.linear.search import Search
+from sbi_active.criticism.linear.model import LinearModel
 from sbi_active.criticism.misfit.contrary import is_left_to_chance, withdrawn
 from sbi_active.criticism.misfit.draws import posterior, shown
 from sbi_active.criticism.misfit.guesses import guess_residual
@@ -26,16 +26,9 @@ from sbi_active.criticism.results import (
     ModelKey,
     Tracing,
 )
-from sbi_active.criticism.rivals.trial_simulator import TrialSimulator
+from sbi_active.criticism.rivals.rival_set import RivalSet
 from sbi_active.criticism.steps.detection import THRESHOLD, credible_set
-from sbi_active.criticism.steps.equivalence import (
-    equivalent_effects,
-    every_action,
-    noise_unit,
-)
 from sbi_active.criticism.steps.predictive import predict
-from sbi_active.criticism.under_misfit import Misfit as Found
-from sbi_active.criticism.under_misfit import ModelError
 from sbi_active.seeding import derive_seed
 
 #: Probability from which an admitted model is recorded with its errors and draws.
@@ -45,39 +38,30 @@ SHOWN = 0.01
 def traced(
     found: Verdict,
     held_out: Trials | None,
-    *,
-    actions: ActionSpace | None = None,
-    near: bool = True,
 ) -> tuple[Tracing, RivalSet]:
     """Return the verdict, and the models behind it with posterior draws.
 
     Args:
         found: The models and what helps.
         held_out: Trials on which the recorded models are scored; None for none.
-        actions: The permitted ones, over which effects like those of the verdict are
-            looked for; None looks at the trials at hand.
-        near: Whether to look for groups that these trials do not separate as well.
     """
     rivals, is_missed = found.rivals, found.is_missed
     probabilities = _tabled(found) if is_missed else found.probabilities
     models = _with_posteriors(found)
     evidences = {str(key): fit.evidence for key, fit in models.fits.items()}
-    groups = equivalent_effects(rivals, None) if near and not is_missed else ()
     by_name = {str(key): p for key, p in probabilities.items()}
     helps, named = found.helps, found.named
     error = found.key.error or (UNEXPLAINED if is_missed else None)
-    trials = rivals.trials
+    trials, chosen = rivals.trials, helps if is_missed else named
     tracing = Tracing(
         verdict=str(ModelKey(named) if named else ModelKey(error=error)),
-        chosen=helps if is_missed else named,
+        chosen=chosen,
         probabilities=by_name,
         inclusion=found.inclusion,
         credible_set=credible_set(by_name),
         equivalent=(*found.equivalent,),
-        near=groups,
         estimates=_estimates(found, evidences),
         evidences=evidences,
-        robust=found.is_robust(),
         guesses=_guesses(found),
         beside=tuple(n for n in helps if n not in named),
         trial_names=dict(zip(trials.index.tolist(), trials.names, strict=True)),
@@ -85,7 +69,7 @@ def traced(
         **(_missing(found, models, held_out) if is_missed else _explaining(found)),
     )
     if found.detection.alarm:
-        aliases = like_the_verdict(found, tracing, None if is_missed else actions)
+        aliases = like_the_verdict(found, chosen, found.equivalent)
         tracing = replace(tracing, aliases=aliases)
     is_withdrawn = not is_missed and is_left_to_chance(tracing)
     return withdrawn(tracing) if is_withdrawn else tracing, models
@@ -152,10 +136,8 @@ def _shown(found: Verdict) -> list[ModelKey]:
 
 def _guesses(found: Verdict) -> tuple[tuple[str, float], ...]:
     """Return what the residual may follow where nothing that was declared explains."""
-    known, is_timed = found.search.sensor.is_known, found.timed
-    answered = found.named or (is_timed and found.is_missed and found.helps)
     is_open = found.is_missed or found.key.error == UNEXPLAINED
-    if answered or not is_open or not (known or not is_timed):
+    if found.timed or found.named or not is_open:
         return ()
     return guess_residual(found.search)
 
@@ -256,7 +238,6 @@ def _estimates(found: Verdict, evidences: dict[str, Evidence]) -> tuple[Estimate
             log_bayes_factor=own.log_evidence - bare,
             mean=center,
             sd=phi.std(0),
-            effective_sample_size=own.effective_sample_size,
             engine=own.engine,
         )
         estimates.append(estimate)
@@ -264,7 +245,7 @@ def _estimates(found: Verdict, evidences: dict[str, Evidence]) -> tuple[Estimate
 
 
 def like_the_verdict(
-    found: Verdict, tracing: Tracing, actions: ActionSpace | None
+    found: Verdict, chosen: Sequence[str], equivalent: Sequence[frozenset[str]]
 ) -> tuple[frozenset[str], ...]:
     r"""Return pairs of an effect of the verdict and one that is nearly the same here.
 
@@ -275,60 +256,34 @@ def like_the_verdict(
     .. math::
         \tfrac1N \sum_i (m_{a,i} - m_{b,i})^2 / s_i^2 < 1 .
 
-    They are not equivalent: repeated trials, or stronger data, tell them apart.
+    They need not be equivalent: another action, repeated trials, or stronger data may
+    tell them apart.
 
     Args:
         found: The verdict, whose search has fitted each effect alone.
-        tracing: What it says, with the groups that are stated already.
-        actions: The permitted ones; None compares on the trials at hand.
+        chosen: Effects that it adds.
+        equivalent: Groups that are stated already.
     """
-    search, log_z = found.search, {}
+    search, models, log_z = found.search, dict[str, LinearModel](), dict[str, float]()
     for name in search.names:
         key = ModelKey((name,))
-        is_beside = tracing.misfit is not None
+        models[name] = search.model(key)
         log_z[name] = (
             search.found[key].beside.log_evidence
-            if is_beside
+            if found.is_missed
             else found.states.log_evidence(key)
         )
     best = max(log_z.values(), default=-np.inf)
     likely = [name for name, value in log_z.items() if value > best - THRESHOLD]
-    pairs = [
-        frozenset({a, b})
-        for a, b in combinations(likely, 2)
-        if {a, b} & {*tracing.chosen}
-        and not any({a, b} <= group for group in (*tracing.equivalent, *tracing.near))
-    ]
-    if not pairs:
-        return ()
-    mean = _predictions(search, likely, actions)
 
-    def is_close(pair: frozenset[str]) -> bool:
-        a, b = pair
-        gap = mean[a] - mean[b]
-        gap = gap[np.isfinite(gap)]
-        return gap.size > 0 and float(np.mean(gap**2)) < 1
+    def is_close(a: str, b: str) -> bool:
+        one, two = (m.scale * m.residual[: m.num] for m in (models[a], models[b]))
+        return float(np.mean((one - two) ** 2)) < 1
 
-    return tuple(pair for pair in pairs if is_close(pair))
-
-
-def _predictions(
-    search: Search, names: Sequence[str], actions: ActionSpace | None
-) -> dict[str, Array]:
-    """Return what each effect predicts at its best fit, in deviations, (N,) each."""
-    models = {name: search.model(ModelKey((name,))) for name in names}
-    if actions is None:
-        return {n: -m.scale * m.residual[: m.num] for n, m in models.items()}
-    rivals, predicted = search.rivals, {}
-    trials = every_action(rivals, actions)
-    seed = derive_seed(rivals.seed, "aliases")
-    simulator = TrialSimulator(rivals.simulator.model, trials, seed=seed)
-    unit = noise_unit(rivals, simulator)
-    for name, model in models.items():
-        coordinates = rivals.rival(model.key).coordinates
-        theta, phi = coordinates.split(model.u[None])
-        for effect in rivals.nuisances:
-            null = effect.null_phi(len(trials), finite=True)
-            phi[effect.name] = null.reshape(1, len(trials), -1)
-        predicted[name] = simulator.predict(theta, phi)[0][0] / unit
-    return predicted
+    return tuple(
+        frozenset(pair)
+        for pair in combinations(likely, 2)
+        if {*pair} & {*chosen}
+        and not any({*pair} <= group for group in equivalent)
+        and is_close(*pair)
+    )

@@ -50,9 +50,9 @@ from functools import cached_property
 
 import numpy as np
 
+from sbi_active.criticism.contradictions import Support
 from sbi_active.criticism.misfit.scored import Scored, predicts_better
 from sbi_active.criticism.results import ModelKey
-from sbi_active.criticism.under_misfit import Support
 from sbi_active.expected import suggests
 from sbi_active.inference.sampling.weights import log_sum_exp
 

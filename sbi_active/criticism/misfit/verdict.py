@@ -18,8 +18,6 @@ from scipy.stats import chi2
 
 from sbi_active.arrays import Array
 from sbi_active.criticism.contradictions import OutlyingTrial
-from sbi_active.criticism.effects.effect import Effect
-from sbi_active.criticism.forces.library import is_force
 from sbi_active.criticism.linear.left_out import Candidate, standard_errors
 from sbi_active.criticism.linear.model import LinearModel
 from sbi_active.criticism.linear.processes import white_variance
@@ -37,7 +35,7 @@ from sbi_active.criticism.results import (
     Detection,
     ModelKey,
 )
-from sbi_active.criticism.steps.detection import LEVEL, RESCALED, THRESHOLD
+from sbi_active.criticism.steps.detection import LEVEL, THRESHOLD
 from sbi_active.criticism.steps.missed_trials import outlying_trials
 from sbi_active.inference.sampling.weights import log_sum_exp
 
@@ -101,9 +99,7 @@ class Verdict:
             return found
         return replace(found, lower_p_value=float(chi2.cdf(square, spare)))
 
-    def _log_bayes_factor(
-        self, use: NDArray[np.bool_] | None = None, factor: float = 1.0
-    ) -> float:
+    def _log_bayes_factor(self, use: NDArray[np.bool_] | None = None) -> float:
         """Return the log Bayes factor of everything else against the bare model.
 
         The residual process, noise inflation and each effect have equal weights;
@@ -119,7 +115,7 @@ class Verdict:
         total, kept = sum(shares.values()), {*self.rivals.effects, UNEXPLAINED, SCATTER}
 
         def log_z(name: str) -> float:
-            return self.states.mixture(ModelKey.of(name), use, factor).log_evidence
+            return self.states.mixture(ModelKey.of(name), use).log_evidence
 
         parts = [
             log_z(name) + float(np.log(share / total))
@@ -151,16 +147,15 @@ class Verdict:
         self,
         c: Candidate,
         use: NDArray[np.bool_] | None = None,
-        factor: float = 1.0,
         standard: Callable[[Candidate], Array] | None = None,
     ) -> Scored:
         """Return what the rule needs of a model."""
-        joint = self.states.joint(c.model.key, use, factor)
+        joint = self.states.joint(c.model.key, use)
         log_p = c.log_prior + log_sum_exp(np.array([*joint.values()]))
         state = max(joint, key=joint.__getitem__).error
         beside, mixture = c.beside, self.search.errors.mixture
-        if use is not None or factor != 1:
-            beside = mixture(c.model, c.grams, use, beside=True, factor=factor)
+        if use is not None:
+            beside = mixture(c.model, c.grams, use, beside=True)
         square = (standard or self.standard)(c)
         log_beside = c.log_prior + beside.log_evidence
         white, m = 1.0, self.search.errors.measurements
@@ -329,26 +324,15 @@ class Verdict:
         Args:
             use: Parts of the trials that count, shape (f,).
         """
-        key = self._chosen(use)
-        if key is None:
+        gains = self._log_bayes_factor(use) >= THRESHOLD
+        if not gains and not self.detection.by_chi_square:
             return ModelKey()
+        standard = standard_errors(self.search.found, self.search.errors, use)
+        key = self._settled(partial(self._scored, use=use, standard=standard)).key
         if self.is_missed:
             return key if key.effects else ModelKey(error=UNEXPLAINED)
         joint = self.states.joint(key, use)
         return max(joint, key=joint.__getitem__)
-
-    def _chosen(
-        self, use: NDArray[np.bool_] | None = None, factor: float = 1.0
-    ) -> ModelKey | None:
-        """Return the effects that help; None without an alarm."""
-        gains = self._log_bayes_factor(use, factor) >= THRESHOLD
-        if not gains and not self.detection.by_chi_square:
-            return None
-        standard = self.standard
-        if use is not None:
-            standard = standard_errors(self.search.found, self.search.errors, use)
-        given = {"use": use, "factor": factor, "standard": standard}
-        return self._settled(partial(self._scored, **given)).key
 
     def outlying(self) -> tuple[OutlyingTrial, ...]:
         """Return the trials that err far more than the others let expect.
@@ -371,23 +355,6 @@ class Verdict:
             )
             for k, times in outlying_trials(square.tolist())
         )
-
-    def is_robust(self) -> bool:
-        """Return whether effect priors of another scale leave what helps."""
-        own = self._kind(self.choice.key)
-        others = (self._chosen(factor=f) or ModelKey() for f in RESCALED)
-        return all(self._kind(other) == own for other in others)
-
-    def _kind(self, key: ModelKey) -> frozenset[str]:
-        """Return the subject of a set: families of forces, or groups of effects."""
-
-        def kind(effect: Effect) -> str:
-            if is_force(effect):
-                return str(effect.family)
-            group = self._group(effect.name)
-            return effect.name if NONE in group else min(group)
-
-        return frozenset(kind(self.rivals.effects[name]) for name in key.effects)
 
 
 def _missing(search: Search, key: ModelKey) -> list[ModelKey]:

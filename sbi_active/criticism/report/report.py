@@ -11,17 +11,17 @@ import cloudpickle
 from sbi_active.actions import ActionSpace
 from sbi_active.criticism.data.trials import Trials
 from sbi_active.criticism.misfit.evaluation import evaluate_held_out
-from sbi_active.criticism.next_trial.severe_tests import severe_tests
-from sbi_active.criticism.report.cautions import cautions
+from sbi_active.criticism.next_action import severe_tests
 from sbi_active.criticism.report.contents import Contents
-from sbi_active.criticism.report.figures import figures
 from sbi_active.criticism.report.gate import Gate, gate_of
 from sbi_active.criticism.report.sections import (
     cautions_with_codes,
+    figures,
     head,
     page,
     tables_of,
 )
+from sbi_active.criticism.report.words import cautions
 from sbi_active.criticism.results import NONE, Evaluation
 from sbi_active.criticism.steps.predictive import find_residuals
 from sbi_active.design.design import action_labels

@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from functools import partial
 from math import inf, isnan
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from sbi_active.criticism.contradictions import Misfit
 from sbi_active.criticism.report.contents import Contents, by_channel, root_mean_square
-from sbi_active.criticism.report.figures import CAPTIONS, METRICS
 from sbi_active.criticism.report.words import (
     NO_PART,
     added,
@@ -28,12 +28,56 @@ from sbi_active.criticism.report.words import (
     verdict_in_words,
     with_error,
 )
-from sbi_active.criticism.results import FEW_DRAWS, NONE, ModelKey
+from sbi_active.criticism.results import NONE, ModelKey
 from sbi_active.criticism.steps.detection import LEVEL
-from sbi_active.criticism.under_misfit import Misfit
 from sbi_active.display.page import Page, Picture, Section
+from sbi_active.display.panels import plot_residuals, plot_scores
 from sbi_active.display.table import Table
 from sbi_active.messages import Message, place
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+METRICS = {
+    "rmse": "RMSE",
+    "energy score": "energy score",
+    "log predictive density": "log predictive density [nats]",
+    "coverage": "share inside the central 90 %",
+}
+CAPTIONS = {
+    "residuals": "Residuals of the models refitted to all trials, in standard "
+    "deviations of the prediction; the band is two of them. Each row has its scale, "
+    "logarithmic beyond the band where residuals are large.",
+    "before_after": "One line a scored trial; the bars are over all of them. Lower is "
+    "better for the first two, higher for the third; the dotted line is 90 %.",
+}
+
+
+def figures(report: Contents) -> dict[str, Figure]:
+    """Return the report's figures by name."""
+    rows, scored = {"bare model": report.residuals}, report.evaluation
+    if report.residuals_after is not None:
+        rows[f"with {added(report)}"] = report.residuals_after
+    labels = () if report.action_is_label else report.action_labels
+    found = {
+        "residuals": plot_residuals(
+            rows, action_labels=labels, channel_names=report.channel_names
+        )
+    }
+    if scored is not None:
+        total = scored.table.set_index("metric")[["before", "after"]]
+        scores = {
+            METRICS[name]: (
+                np.stack([scored.before[name], scored.after[name]]),
+                total.loc[name].to_numpy(),
+            )
+            for name in METRICS
+        }
+        rmse, energy, _, coverage = scores
+        found["before_after"] = plot_scores(
+            scores, errors=(rmse, energy), levels={coverage: 0.9}
+        )
+    return found
 
 
 def shown(report: Contents) -> list[dict[str, Any]]:
@@ -94,13 +138,10 @@ def _parameters(report: Contents) -> Table:
     """Return parameters of the bare model, and of the verdict's where it has more."""
     tracing, num = report.tracing, 1 + (report.verdict != NONE)
     units = {e.name: f" [{e.units}]" for e in tracing.estimates if e.units}
-    models = [tracing.evidences.get(name) for name in (NONE, tracing.model)]
-    draws = [inf if e is None else e.effective_sample_size for e in models]
     rows = []
     for name, *values in report.parameters.to_numpy():
-        pairs = zip(values[::2], values[1::2], draws, strict=True)
-        each = [with_error(mean, sd, of) for mean, sd, of in pairs]
-        rows.append((name + units.get(name, ""), *each[:num]))
+        each = map(with_error, values[::2], values[1::2])
+        rows.append((name + units.get(name, ""), *[*each][:num]))
     header = ["parameter", "bare model", f"with {added(report)}"]
     return Table(header[: 1 + num], rows)
 
@@ -128,23 +169,20 @@ def _effects(report: Contents) -> Table:
     rows = []
     for name in (name for name in tracing.probabilities if name not in small):
         p, e = tracing.probabilities[name], estimates.get(name)
-        evidence, phi, gain, fit = tracing.evidences.get(name), "", -inf, ["", ""]
+        evidence, phi, gain, factor = tracing.evidences.get(name), "", -inf, ""
         if e is not None:
-            pairs = zip(e.mean, e.sd, strict=True)
-            each = [with_error(m, sd, e.effective_sample_size) for m, sd in pairs]
-            phi = f"{', '.join(each)} {e.units}".strip()
+            phi = f"{', '.join(map(with_error, e.mean, e.sd))} {e.units}".strip()
         if evidence is not None:
             gain = evidence.log_evidence - null
-            draws = f"{evidence.effective_sample_size:.0f}"
-            fit = [f"{round(gain, 1) + 0.0:.1f}", draws]
+            factor = f"{round(gain, 1) + 0.0:.1f}"
         any_set = probability(tracing.inclusion.get(name, p)) if e else ""
         inside = "yes" if name in tracing.credible_set else ""
         cells = [label(tracing, name), *[probability(p)] * has_p, *[any_set] * has_sets]
-        cells += [phi, *fit, *[inside] * has_p]
+        cells += [phi, factor, *[inside] * has_p]
         rows.append((-p if has_p else 0.0, -gain, cells))
     rows.sort(key=lambda row: row[:2])
     header = ["model", *["P"] * has_p, *["P in any set"] * has_sets, "phi", "log BF"]
-    return Table([*header, "ESS", *["90 % set"] * has_p], [cells for *_, cells in rows])
+    return Table([*header, *["90 % set"] * has_p], [cells for *_, cells in rows])
 
 
 def _by_trial(report: Contents) -> Table:
@@ -218,7 +256,6 @@ def _prose(report: Contents, *, sections: bool = True) -> list[str]:
     if misfit is not None:
         refuted = tracing.instead_of if tracing.refuted else ""
         helpful = str(ModelKey(misfit.helps)) if misfit.helps else refuted
-    models = [tracing.evidences.get(n) for n in (NONE, tracing.model)]
     gain = np.zeros(1) if plan is None else plan.information_gain
     values: dict[str, Any] = {
         "verdict": verdict_in_words(report),
@@ -250,8 +287,6 @@ def _prose(report: Contents, *, sections: bool = True) -> list[str]:
         "not_shown": len(table) - len(shown(report)),
         "several": by_channel(report.residuals.x, report.residuals).shape[2] > 1,
         "metrics": METRICS,
-        "fewest": FEW_DRAWS,
-        "few_draws": any(e and e.effective_sample_size < FEW_DRAWS for e in models),
         "moves": _moves(report),
         "most_told": float(np.nanmax(gain, initial=0.0)),
         **_sizes_left(report),
@@ -306,13 +341,11 @@ def _sizes_left(report: Contents) -> dict[str, Any]:
 def _groups(report: Contents) -> list[tuple[frozenset[str], str]]:
     """Return the groups of models that nothing separates, or not these trials."""
     tracing = report.tracing
-    near = [group for group in tracing.near if group not in tracing.equivalent]
     like = [frozenset.union(*tracing.aliases)] if tracing.aliases else []
     why = {
         "no permitted action separates them": tracing.equivalent,
-        "not separated by these trials; another action may": near,
-        "nearly the same here, apart by less than the noise; repeated trials may "
-        "separate them": like,
+        "nearly the same here, apart by less than the noise; another action or "
+        "repeated trials may separate them": like,
     }
     return [(group, said) for said, groups in why.items() for group in groups]
 

@@ -1,4 +1,4 @@
-"""Words of a report: templates, numbers and names, and a verdict in clauses."""
+"""Words of a report: numbers and names, a verdict in clauses, and its cautions."""
 
 from __future__ import annotations
 
@@ -8,22 +8,30 @@ from functools import cache
 from typing import Any
 
 import numpy as np
+from scipy.stats import rankdata
 
+from sbi_active.criticism.contradictions import UNDECLARED, Misfit
+from sbi_active.criticism.data.trials import Trials
+from sbi_active.criticism.effects.effect import Effect
 from sbi_active.criticism.forces.library import COUPLING, FAMILY
 from sbi_active.criticism.report.contents import Contents
 from sbi_active.criticism.results import (
-    FEW_DRAWS,
     NONE,
     OUTLIER,
     SCATTER,
     UNEXPLAINED,
     Array,
     ModelKey,
+    Residuals,
     Tracing,
 )
-from sbi_active.criticism.steps.detection import LEVEL, credible_set
-from sbi_active.criticism.under_misfit import UNDECLARED, Misfit
+from sbi_active.criticism.rivals.rival import surprising_outcomes
+from sbi_active.criticism.rivals.rival_set import FEW_TRIALS
+from sbi_active.criticism.steps.detection import LEVEL, REFUTED, TOO_SMALL, credible_set
 from sbi_active.display.page import environment
+from sbi_active.messages import Message
+from sbi_active.seeding import forked_generators
+from sbi_active.simulation.conditions import parameters_of
 
 
 def blocks(template: str, **values: Any) -> list[str]:
@@ -65,29 +73,23 @@ def number(value: float) -> str:
     return f"{value:.0f}" if 1e3 <= abs(value) < 1e6 else f"{value:.3g}"
 
 
-def with_error(mean: float, sd: float, draws: float = np.inf) -> str:
+def with_error(mean: float, sd: float) -> str:
     """Return a mean to the second digit of its deviation; nothing for NaN.
 
-    A mean that is known better than that has six digits, and one with few draws behind
-    it no deviation.
+    A mean that is known better than that has six digits.
 
     Args:
         mean: Mean of the draws.
         sd: Standard deviation of the draws.
-        draws: Effective number of the draws.
 
     Example:
         >>> with_error(0.35992, 0.00071), with_error(1234.5, 56.7)
         ('0.35992 +- 0.00071', '1234 +- 57')
-        >>> with_error(159.873313255, 2.8e-14), with_error(0.35992, 0.00071, 3)
-        ('159.873 +- 2.8e-14', 'about 0.36')
-        >>> with_error(-0.003, 1.9)
-        '0.0 +- 1.9'
+        >>> with_error(159.873313255, 2.8e-14), with_error(-0.003, 1.9)
+        ('159.873 +- 2.8e-14', '0.0 +- 1.9')
     """
     if np.isnan(mean):
         return ""
-    if draws < FEW_DRAWS:
-        return f"about {mean:.2g}"
     size = abs(mean) + sd
     if not (sd > 0 and 1e-4 <= size < 1e6):  # powers of ten, or no deviation
         return f"{mean:.4g} +- {sd:.2g}"
@@ -223,3 +225,125 @@ def sizes(report: Contents, *values: Array) -> str:
         f"{f'{name} ' * (len(each) > 1)}{text} {unit}".rstrip()
         for (name, unit), text in zip(channels, each, strict=True)
     )
+
+
+def cautions(
+    report: Contents, trials: Trials, *, designed: bool = False, loop: Any = None
+) -> tuple[Message, ...]:
+    """Return the cautions that limit the conclusions, a sentence each.
+
+    Args:
+        report: Report without them.
+        trials: The measured trials.
+        designed: Actions were chosen for their information.
+        loop: The comparison, a :class:`.Criticism`, for what was left out of it; None
+            asks nothing of it.
+    """
+    tracing, fit, own = report.tracing, trials.fit, report.residuals
+    if report.residuals_after is not None and tracing.chosen:
+        own = report.residuals_after
+    is_ordered, rough = fit.order == "known", own.roughness
+    rough = None if rough is None else rough[rough > 0]
+    said = blocks(
+        "cautions",
+        report=report,
+        designed=designed,
+        loop=loop,
+        num_trials=int(fit.valid.sum()),
+        few_trials=FEW_TRIALS,
+        is_sorted=is_ordered and not fit.action_is_label and _aliased(fit),
+        growth=report.growth if is_ordered else None,
+        disagreeing=_disagreeing(own),
+        rough=None if rough is None else (rough.min(), rough.max()),
+        correlation=_correlation(own),
+        missed=() if report.evaluation is None else report.evaluation.missed,
+        infinity=np.inf,
+        refuted=REFUTED,
+        too_small=TOO_SMALL,
+        edge=_at_edge(tracing, getattr(report.prior, "effects", ())),
+        may_be_force=_may_be_force(report),
+        no_part=NO_PART,
+        suspects=suspects_in_words(tracing),
+        rests=rests(tracing) if tracing.needed else "",
+        narrow_prior=narrow_prior(tracing),
+    )
+    return (*map(Message, dict.fromkeys(said)),)
+
+
+def _disagreeing(own: Residuals) -> list[str]:
+    """Return the trials whose having an outcome the model holds for improbable."""
+    kinds = [
+        "gave no measurement where the model is sure of one",
+        "gave a measurement where the model is sure of none",
+    ]
+    return [
+        f"trial{'s' * (len(which) > 1)} {', '.join(map(own.called, which))} {what}"
+        for which, what in zip(surprising_outcomes(own), kinds, strict=True)
+        if which
+    ]
+
+
+def _may_be_force(report: Contents) -> bool:
+    """Return whether the simulator takes forces, misses something, and tried none."""
+    tracing = report.tracing
+    misses = tracing.misfit is not None and not tracing.misfit.passes
+    if not (misses or report.verdict == UNEXPLAINED):
+        return False
+    is_tried = any(e.family.startswith((FAMILY, COUPLING)) for e in tracing.estimates)
+    taken = [p.name for p in parameters_of(report.simulator.fn)]
+    return "force" in taken and not is_tried
+
+
+def _aliased(trials: Trials, *, limit: float = 0.9) -> bool:
+    """Return whether an entry of the action goes with the order of execution."""
+    order = rankdata(trials.index.numpy())
+    return any(
+        len(value) > 2
+        and np.ptp(value) > 0
+        and abs(np.corrcoef(order, rankdata(value))[0, 1]) > limit
+        for value in trials.action.numpy().T
+    )
+
+
+def _correlation(own: Residuals, *, long: int = 10, least: float = 0.3) -> float:
+    """Return that of neighbors in x's first axis; 0 where it is no reason to warn.
+
+    Args:
+        own: Residuals, standardized.
+        long: Entries a trial of x that may be a trajectory.
+        least: Correlation that is one; so are four of its standard errors.
+    """
+    z = own.refitted
+    is_declared = own.times is not None and own.correlation != 0.0
+    pairs = np.stack([z[:, :-1].ravel(), z[:, 1:].ravel()])
+    pairs = pairs[:, np.isfinite(pairs).all(0)]
+    num = pairs.shape[1]
+    if is_declared or z.shape[1] < long or num < 3 or not pairs.std(1).all():
+        return 0.0
+    found = float(np.corrcoef(pairs)[0, 1])
+    return found if found > max(least, 4 / np.sqrt(num)) else 0.0
+
+
+def _at_edge(tracing: Tracing, effects: Sequence[Effect]) -> list[tuple[Effect, float]]:
+    """Return effects of the verdict at the edge of their prior, and the largest phi."""
+    evidence = tracing.evidences.get(tracing.model)
+    found = []
+    for effect in effects:
+        if effect.name in tracing.chosen and evidence is not None:
+            columns = [evidence.names.index(name) for name in effect.phi_names]
+            phi = evidence.draws[:, columns].mean(0)
+            if _is_extreme(effect, phi):
+                found.append((effect, float(phi[np.argmax(np.abs(phi))])))
+    return found
+
+
+def _is_extreme(effect: Effect, mean: Array, *, edge: float = 0.01) -> bool:
+    """Return whether phi is further from the null than almost all of its prior."""
+    null = effect.null_phi(1).numpy()[0]
+
+    def away(phi: Array) -> Array:  # from an infinite null the far end is away from it
+        return np.where(np.isfinite(null), np.abs(phi - null), -np.sign(null) * phi)
+
+    with forked_generators(0, "edge"):
+        draws = effect.sample(2_000).numpy()
+    return bool(((away(draws) > away(mean)).mean(0) < edge).any())

@@ -27,8 +27,6 @@ Name = TypeVar("Name")
 
 #: All sets of one effect more are together this much less probable, nats.
 COST = float(np.log(3.0))
-#: Factors on the scale of the effects' priors under which a verdict should stand.
-RESCALED = (1 / 3, 3.0)
 
 
 def log_priors(effects: Sequence[Effect]) -> dict[str, float]:

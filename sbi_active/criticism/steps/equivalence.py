@@ -14,12 +14,12 @@ from sbi_active.actions import ActionSpace
 from sbi_active.arrays import Array
 from sbi_active.criticism.data.trials import Trials
 from sbi_active.criticism.effects.effect import Effect
-from sbi_active.criticism.evidence.rival_set import RivalSet
+from sbi_active.criticism.effects.trial_conditions import unmeasured
 from sbi_active.criticism.forces.library import is_force
 from sbi_active.criticism.results import NONE
 from sbi_active.criticism.rivals.coordinates import SearchCoordinates
-from sbi_active.criticism.rivals.further_trials import unmeasured
-from sbi_active.criticism.rivals.noise_grid import declared_noise
+from sbi_active.criticism.rivals.error_models import declared_noise
+from sbi_active.criticism.rivals.rival_set import RivalSet
 from sbi_active.criticism.rivals.trial_simulator import TrialSimulator
 from sbi_active.inference.sampling.least_squares import basis_of
 from sbi_active.seeding import derive_seed, forked_generators
@@ -68,7 +68,7 @@ def equivalent_effects(
     """
     # Of six parameters five must agree; far from its null a pair is compared at two.
     num_theta, agreement, num_far = 6, 0.8, 2
-    trials = rivals.trials if actions is None else every_action(rivals, actions)
+    trials = rivals.trials if actions is None else _every_action(rivals, actions)
     world = _World(rivals, trials)
     effects = [e for e in rivals.effects.values() if e.hook != "noise"]
     votes = np.zeros((2, len(effects) + 1, len(effects) + 1))
@@ -102,15 +102,6 @@ def equivalent_effects(
     return tuple(g for g in found if len(g) > 1)
 
 
-def noise_unit(rivals: RivalSet, simulator: TrialSimulator) -> Array:
-    """Return the size that counts as large in each number of trials, shape (N,)."""
-    noise = declared_noise(rivals.model.noise, simulator.measurements)
-    unit = noise.typical_sd
-    if rivals.model.noise is None:
-        unit = np.full(len(unit), np.median(rivals.spread))
-    return unit
-
-
 class _World:
     """Predictions of trials, in noise units.
 
@@ -124,7 +115,10 @@ class _World:
             rivals.simulator.model, trials, seed=derive_seed(rivals.seed, "equivalence")
         )
         self.prior, self.is_smooth = rivals.prior, rivals.is_smooth
-        self.unit = noise_unit(rivals, self.simulator)
+        self.unit = np.median(rivals.spread)  # what counts as large
+        if (noise := rivals.model.noise) is not None:
+            own = declared_noise(noise, self.simulator.measurements)
+            self.unit = own.typical_sd
         self.step = max(rivals.step, 1e-4)  # from the null, in deviations of the prior
         self.coordinates = SearchCoordinates(self.prior, (), (), len(trials))
 
@@ -270,7 +264,7 @@ def _alike(left: list[tuple[Array, float]], local: list[bool]) -> Array:
     return np.stack([same, told])
 
 
-def every_action(rivals: RivalSet, actions: ActionSpace) -> Trials:
+def _every_action(rivals: RivalSet, actions: ActionSpace) -> Trials:
     """Return the trials at hand and one of every permitted action, in random order.
 
     Of a list that is longer, or a box, 48 actions stand for all.

@@ -11,12 +11,12 @@ from torch import Tensor
 from sbi_active.arrays import Array
 from sbi_active.criticism.data.measurements import Measurements
 from sbi_active.criticism.data.trials import Trials
-from sbi_active.criticism.evidence.fit import Fit
-from sbi_active.criticism.evidence.rival_set import RivalSet
 from sbi_active.criticism.results import ModelKey, Residuals
 from sbi_active.criticism.rivals.error_models import LOG_2PI
+from sbi_active.criticism.rivals.fit import Fit
 from sbi_active.criticism.rivals.residual_process import ResidualProcess
 from sbi_active.criticism.rivals.rival import log_outcomes
+from sbi_active.criticism.rivals.rival_set import RivalSet
 from sbi_active.criticism.rivals.trial_simulator import TrialSimulator
 from sbi_active.inference.sampling.weights import log_sum_exp
 from sbi_active.seeding import derive_seed, forked_generators

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from sbi_active.criticism import Trials
-from sbi_active.criticism.data.sampling import Sampling, suggested_sampling, thinned
+from sbi_active.criticism.linear.screening import Sampling, suggested_sampling, thinned
 from tests.effects import autocorrelated
 
 STEP = 0.02
@@ -74,8 +74,6 @@ def test_gaps_several_channels_and_ragged_trials():
     assert 5 <= suggested_sampling(trials, x).every <= 13
     by_model = Trials(torch.arange(6.0), x)
     assert suggested_sampling(by_model, x, times).every <= 13
-    with pytest.raises(ValueError, match="expected sample times of trajectories"):
-        suggested_sampling(by_model, x)
 
 
 def sampling(every, step=1.0):
@@ -92,7 +90,6 @@ def test_thinning_masks_and_changes_nothing_else():
     assert torch.equal(few.sample_times, trials.sample_times)
     assert (few.names, few.role) == (trials.names, trials.role)
     assert trials.mask.all()
-    assert torch.equal(thinned(trials, sampling(1)).x, trials.x)
 
 
 def test_channels_of_other_rates_and_short_trials_keep_their_own():

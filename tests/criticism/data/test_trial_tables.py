@@ -1,6 +1,5 @@
 """Trials from tables and folders: what is read, and what a user is told of it."""
 
-import re
 from pathlib import Path
 
 import numpy as np
@@ -136,25 +135,6 @@ def test_a_table_in_another_encoding(encoding):
 def test_options_that_do_not_fit_the_table(options, message):
     with pytest.raises(ValueError, match=message):
         read(["1,0,1,5"], SHORT, **options)
-
-
-@pytest.mark.parametrize(
-    ("sizes", "steps", "message"),
-    [
-        ((1, 1, 1000, 1), (1, 1, 1, 1), "x_y of trials 2 .* times larger"),
-        ((1, 1, 1, 1), (1, 1, 1, 0.001), "time of trials 3 .* 1000 times smaller"),
-        ((1, 3, 9, 27), (1, 1, 1, 1), ""),  # differ little
-    ],
-)
-def test_a_trial_in_another_unit_is_noted(sizes, steps, message, recwarn):
-    rows = [
-        f"{t},{s * steps[t]},{t + 1},{(5 - s) * sizes[t] + t / 9}"
-        for t in range(4)
-        for s in (0, 1)
-    ]
-    assert len(read(rows, SHORT)) == 4
-    assert len(recwarn) == bool(message)
-    assert all(re.search(message, str(w.message)) for w in recwarn)
 
 
 # Cells of tables: what names a trial, when it was, and what is no number

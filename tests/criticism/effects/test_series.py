@@ -9,7 +9,6 @@ from sbi.utils import BoxUniform
 
 from sbi_active import GaussianNoise, SimulatorModel
 from sbi_active.criticism import (
-    Context,
     Trials,
     close_loop,
     varying_parameters,
@@ -22,10 +21,7 @@ from sbi_active.criticism.effects.changes import (
     played,
     rounded,
 )
-from sbi_active.criticism.effects.first_samples import (
-    start_from_first_samples,
-    zero_from_first_samples,
-)
+from sbi_active.criticism.effects.first_samples import start_from_first_samples
 
 STEP = torch.tensor(0.1).double()
 
@@ -187,28 +183,6 @@ def test_a_second_derivative_and_channels_of_their_own_errors():
     start = {k: float(v) for k, v in found.start.items()}
     assert start == pytest.approx({"load": 8.0, "force": 3.0, "angle": 1.0})
     assert (deviations[0] / deviations[1]).tolist() == pytest.approx([1, 10])
-
-
-def test_zeros_are_taken_from_x_and_are_left_by_the_sensor_alone():
-    rng = np.random.default_rng(0)
-    zero = torch.from_numpy(rng.normal(0, 50, (300, 1, 1)))
-    push = torch.cat([torch.zeros(5), torch.ones(15)]).double()[None, :, None]
-    noise = SENSOR * torch.from_numpy(rng.normal(size=(300, 20, 1)))
-    x = torch.cat([torch.ones(300, 20, 1), zero + push + noise], -1)
-    trials = Trials(torch.arange(300.0), x, sample_times=TIMES)
-    found, nuisance = zero_from_first_samples(
-        trials, within=0.45, sd=SENSOR, channels=[1], width=1.0
-    )
-    sd = float(nuisance.prior.stddev)
-    assert sd == pytest.approx(SENSOR / 5**0.5)
-    expected = (sd**2 + SENSOR**2 / 15) ** 0.5
-    left = (found.x[:, 5:, 1] - 1).mean(1)
-    assert float(left.std()) == pytest.approx(expected, rel=0.15)
-    assert torch.equal(trials.x, x)
-    one = torch.ones(300, 1)
-    changed = nuisance.apply(found.x, one, found.action, Context(torch.zeros(300)))
-    assert torch.equal(changed[..., 0], x[..., 0])
-    assert torch.allclose(changed[..., 1], found.x[..., 1] + 1)
 
 
 def test_a_line_that_hides_gravity_is_said():

@@ -9,9 +9,9 @@ from torch.distributions import Independent, Normal
 
 from sbi_active import DiscreteActions, GaussianNoise, SimulatorModel
 from sbi_active.criticism import AugmentedSimulator, Trials
-from sbi_active.criticism.evidence.fit import THOROUGH, settings_of
-from sbi_active.criticism.evidence.rival_set import RivalSet
 from sbi_active.criticism.results import ModelKey
+from sbi_active.criticism.rivals.fit import THOROUGH, settings_of
+from sbi_active.criticism.rivals.rival_set import RivalSet
 from sbi_active.criticism.rivals.trial_simulator import TrialSimulator
 from sbi_active.inference.engine import infer, search
 from tests.effects import BIAS, effect, normal, on_outcomes

@@ -12,8 +12,7 @@ from torch.distributions import Gamma, Independent
 from sbi_active import GaussianNoise, SimulatorModel
 from sbi_active.criticism import Trials
 from sbi_active.criticism.identification import IdentifySettings, identify
-from sbi_active.criticism.identification.channels import ChannelErrors
-from sbi_active.criticism.identification.posterior import Posterior
+from sbi_active.criticism.identification.posterior import ChannelErrors, Posterior
 from sbi_active.criticism.linear.mixture import integrated
 from sbi_active.criticism.linear.model import LinearModel
 from sbi_active.criticism.linear.processes import Grams, Processes

@@ -8,10 +8,10 @@ from torch.distributions import Independent, Normal, Uniform
 
 from sbi_active import GaussianNoise, SimulatorModel, StudentTNoise
 from sbi_active.criticism import Criticism, Trials
-from sbi_active.criticism.evidence.rival_set import RivalSet
 from sbi_active.criticism.linear.screening import linear_models
 from sbi_active.criticism.misfit.verdict import judge
 from sbi_active.criticism.results import ModelKey
+from sbi_active.criticism.rivals.rival_set import RivalSet
 from tests.effects import on_outcomes
 
 SD = 0.3

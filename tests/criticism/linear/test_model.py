@@ -6,9 +6,9 @@ from sbi.utils import BoxUniform
 
 from sbi_active import GaussianNoise, SimulatorModel
 from sbi_active.criticism import Trials
-from sbi_active.criticism.evidence.rival_set import RivalSet
 from sbi_active.criticism.linear.model import centered, linearize
 from sbi_active.criticism.results import ModelKey
+from sbi_active.criticism.rivals.rival_set import RivalSet
 
 PRIOR = BoxUniform(torch.tensor([1.0, 0.5]), torch.tensor([20.0, 2.0]))
 SD = 1e-6

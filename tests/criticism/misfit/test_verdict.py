@@ -9,9 +9,9 @@ from sbi.utils import BoxUniform
 
 from sbi_active import DiscreteActions, GaussianNoise, SimulatorModel
 from sbi_active.criticism import Criticism, Trials
-from sbi_active.criticism.evidence.rival_set import RivalSet
 from sbi_active.criticism.forces import force_effects
 from sbi_active.criticism.results import SCATTER, UNEXPLAINED, ModelKey
+from sbi_active.criticism.rivals.rival_set import RivalSet
 from sbi_active.criticism.steps.detection import REFUTED
 from tests.criticism.forces.test_forces import MODEL, PRIOR, SD, measured
 from tests.criticism.misfit.oscillator import EFFECTS, SENSOR, TIMES, oscillate

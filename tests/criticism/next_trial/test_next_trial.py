@@ -9,9 +9,8 @@ from sbi.utils import BoxUniform
 from scipy.stats import entropy
 
 from sbi_active import DiscreteActions, GaussianNoise, SimulatorModel
-from sbi_active.criticism import Criticism, Trials
-from sbi_active.criticism.next_trial import next_action
-from sbi_active.criticism.next_trial.next_action import (
+from sbi_active.criticism import Criticism, Trials, next_action
+from sbi_active.criticism.next_action import (
     PredictedRival,
     beyond_range,
     choose_action,

@@ -9,6 +9,7 @@ from sbi.utils import BoxUniform
 
 from sbi_active import DiscreteActions, GaussianNoise, SimulatorModel
 from sbi_active.criticism import Trials
+from sbi_active.criticism.contradictions import Misfit, ModelError, Support
 from sbi_active.criticism.report.report import build_report
 from sbi_active.criticism.results import (
     Detection,
@@ -20,7 +21,6 @@ from sbi_active.criticism.results import (
     Residuals,
     Tracing,
 )
-from sbi_active.criticism.under_misfit import Misfit, ModelError, Support
 from tests.effects import on_outcomes
 
 DRAG = on_outcomes("drag", lambda x, phi, action, context: x - phi)
@@ -52,7 +52,6 @@ def estimate(name: str, probability: float, **changes) -> Estimate:
         log_bayes_factor=9.4,
         mean=np.array([0.123]),
         sd=np.array([0.011]),
-        effective_sample_size=312.0,
         engine="least squares",
     )
     return replace(made, **changes)
@@ -69,10 +68,8 @@ def tracing(verdict: str = "drag", **changes) -> Tracing:
         inclusion={"drag": 0.81, "tilt": 0.125, "bias": 0.05},
         credible_set=("drag", "tilt"),
         equivalent=(),
-        near=(),
         estimates=tuple(estimate(n, probabilities[n]) for n in NAMES),
         evidences={n: evidence(n, -3.0) for n in ["none", *NAMES, "unexplained"]},
-        robust=True,
     )
     return replace(made, **changes)
 

@@ -12,12 +12,8 @@ from sbi.utils import BoxUniform
 
 from sbi_active.criticism import joint_prior
 from sbi_active.criticism.contradictions import SevereTest
-from sbi_active.criticism.report.figures import (
-    AFTER,
-    BEFORE,
-    plot_residuals,
-)
 from sbi_active.criticism.report.sections import head
+from sbi_active.display.panels import AFTER, BEFORE, plot_residuals
 from tests.criticism.report.reports import DRAG, report, residuals, tracing
 from tests.display.parsed import Parsed
 
@@ -101,7 +97,8 @@ def points(ax):
 @pytest.mark.parametrize("num", [1, 6])
 def test_every_residual_is_drawn_at_its_action_its_trial_and_its_channel(num):
     both = residuals((num,), size=4.0), residuals((num,))
-    figure = plot_residuals(*both, action_labels=["speed"], added="a gain")
+    rows = dict(zip(("bare model", "with a gain"), both, strict=True))
+    figure = plot_residuals(rows, action_labels=["speed"])
     columns = 2 if num == 1 else 3
     assert len(figure.axes) == 2 * columns
     for row, (made, color) in enumerate(zip(both, (BEFORE, AFTER), strict=True)):

@@ -126,10 +126,6 @@ CASES = {
         smooth(0.95, np.arange(40.0)),
         smooth(0.95, np.arange(40.0), known=0.9),
     ),
-    "SA508": (
-        with_evidence(effective_sample_size=49.0),
-        with_evidence(standard_error=0.4),
-    ),
     "SA509": (noted(**WEAK), noted(**WEAK | {"p_value": 0.02})),
     "SA510": (told(p_value=1e-4), told(p_value=0.1)),
     "SA512 does not lower": (errors(1.1), errors(0.9)),
@@ -141,7 +137,6 @@ CASES = {
     "SA514": ({"evaluation": replace(HELD, missed=(MISSED,))}, {}),
     "SA515": (pushed(3.0), pushed(2.0)),
     "SA516": (pushed(3.0), pushed(3.0, "dynamics")),
-    "SA517": (told(robust=False), told()),
     "SA518": (told("unexplained"), told("scatter")),
     "SA519": (told("scatter"), told("unexplained")),
     "SA520": ({"exploratory": True}, {}),

@@ -9,7 +9,7 @@ from torch.distributions import Independent, Uniform
 from sbi_active import AutocorrelatedNoise, SimulatorModel
 from sbi_active.criticism import Criticism, Effect, Trials
 from sbi_active.criticism.data import Measurements
-from sbi_active.criticism.rivals.noise_grid import declared_noise
+from sbi_active.criticism.rivals.error_models import declared_noise
 from tests.effects import half
 
 TIMES = np.array([0.0, 0.1, 0.3, 0.6])

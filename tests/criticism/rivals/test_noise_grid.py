@@ -9,7 +9,7 @@ from scipy.stats import multivariate_normal
 from sbi_active import AutocorrelatedNoise, GaussianNoise, estimate_noise
 from sbi_active.criticism import Trials
 from sbi_active.criticism.data.measurements import Measurements
-from sbi_active.criticism.rivals.noise_grid import (
+from sbi_active.criticism.rivals.error_models import (
     INDEPENDENT,
     NUM_DRAWS,
     declared_noise,

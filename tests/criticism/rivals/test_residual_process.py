@@ -8,8 +8,11 @@ from scipy.stats import multivariate_normal
 from sbi_active import GaussianNoise
 from sbi_active.criticism import Trials
 from sbi_active.criticism.data.measurements import Measurements
-from sbi_active.criticism.rivals.error_models import NoiseCell, NoiseGrid
-from sbi_active.criticism.rivals.noise_grid import declared_noise
+from sbi_active.criticism.rivals.error_models import (
+    NoiseCell,
+    NoiseGrid,
+    declared_noise,
+)
 from sbi_active.criticism.rivals.residual_process import TIME_LENGTH, ResidualProcess
 
 ACTION = torch.linspace(-2, 2, 8)[:, None]

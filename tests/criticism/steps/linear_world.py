@@ -10,10 +10,10 @@ from torch.distributions import Independent, Normal
 
 from sbi_active import GaussianNoise, SimulatorModel
 from sbi_active.criticism import Effect, Trials
-from sbi_active.criticism.evidence.rival_set import RivalSet
 from sbi_active.criticism.linear.mixture import WIDTHS
 from sbi_active.criticism.linear.screening import linear_models
 from sbi_active.criticism.misfit.verdict import Verdict, judge
+from sbi_active.criticism.rivals.rival_set import RivalSet
 from tests.effects import added
 
 ACTION = torch.linspace(-2, 2, 12)[:, None]

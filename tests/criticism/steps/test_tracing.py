@@ -8,10 +8,10 @@ import torch
 from scipy.stats import norm
 
 from sbi_active.criticism import Trials
-from sbi_active.criticism.evidence.rival_set import RivalSet
 from sbi_active.criticism.misfit.evaluation import evaluate_held_out, evaluate_left_out
 from sbi_active.criticism.misfit.record import traced
 from sbi_active.criticism.results import ModelKey
+from sbi_active.criticism.rivals.rival_set import RivalSet
 from sbi_active.criticism.steps.predictive import find_residuals
 from tests.criticism.steps import linear_world
 from tests.criticism.steps.linear_world import (
@@ -59,7 +59,7 @@ def test_estimates_are_those_of_each_effect_alone():
     for estimate in tracing.estimates:
         mean, covariance = posterior(x, (estimate.name,))
         sd = covariance[-1, -1] ** 0.5
-        error = 4 * sd * np.sqrt(1 / 400 + 1 / estimate.effective_sample_size)
+        error = 4 * sd * np.sqrt(2 / 400)
         if found.misses(ModelKey((estimate.name,))):
             assert abs(estimate.mean - mean[-1]) < estimate.sd
             assert estimate.sd > 2 * sd
@@ -92,20 +92,12 @@ def test_what_an_effect_leaves_over_is_unexplained_beside_it():
     assert not tracing.misfit.passes
 
 
-@pytest.mark.parametrize(
-    ("phi", "robust"), [({"curve": 0.065}, False), ({"curve": 0.5}, True), ({}, True)]
-)
-def test_a_verdict_that_hangs_on_the_width_of_a_prior_is_not_robust(phi, robust):
-    assert tracing_of(measured(**phi))[0].robust == robust
-
-
 def test_effects_that_the_trials_do_not_separate_count_as_one():
     twin = added("twin", lambda xi: 0.5 * (xi**2 - 1), family="dynamics")
     group = frozenset({"curve", "twin"})
     tracing, _ = traced(
         judged(rivals(measured(curve=0.1, kink=0.28), twin), [group]), None
     )
-    assert group in tracing.near
     assert tracing.equivalent == (group,)
     assert tracing.verdict == max(group, key=tracing.probabilities.__getitem__)
 

@@ -1,85 +1,49 @@
-"""Figures of a report: residuals, and the error before and after."""
+"""Panels of a figure: residuals of trials, and scores before and after."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sbi_active.criticism.report.contents import Contents
-from sbi_active.criticism.report.words import added
-from sbi_active.criticism.results import Array, Evaluation, Residuals
+from sbi_active.arrays import Array
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 BEFORE, AFTER, FAINT = "#c1432e", "#2f6f9f", "#9aa3ab"
-METRICS = {
-    "rmse": "RMSE",
-    "energy score": "energy score",
-    "log predictive density": "log predictive density [nats]",
-    "coverage": "share inside the central 90 %",
-}
-CAPTIONS = {
-    "residuals": "Residuals of the models refitted to all trials, in standard "
-    "deviations of the prediction; the band is two of them. Each row has its scale, "
-    "logarithmic beyond the band where residuals are large.",
-    "before_after": "One line a scored trial; the bars are over all of them. Lower is "
-    "better for the first two, higher for the third; the dotted line is 90 %.",
-}
-
-
-def figures(report: Contents) -> dict[str, Figure]:
-    """Return the report's figures by name."""
-    found = {
-        "residuals": plot_residuals(
-            report.residuals,
-            report.residuals_after,
-            action_labels=() if report.action_is_label else report.action_labels,
-            channel_names=report.channel_names,
-            added=added(report),
-        ),
-    }
-    if report.evaluation is not None:
-        found["before_after"] = plot_before_after(report.evaluation)
-    return found
 
 
 def plot_residuals(
-    before: Residuals,
-    after: Residuals | None = None,
+    rows: Mapping[str, Any],
     *,
     action_labels: Sequence[str] = (),
     channel_names: Sequence[str] | None = None,
-    added: str = "the effect",
 ) -> Figure:
     """Draw standardized residuals by action, trial, and channel or time.
 
-    Each model is refitted to all trials that may be fitted. The band is two standard
-    deviations of the predictive.
+    The band is two standard deviations.
 
     Args:
-        before: Residuals of the bare model, the upper row.
-        after: Residuals of the augmented one, the lower row; None if nothing was
-            added.
+        rows: Residuals of two models at most, a row each, by their titles: objects with
+            ``refitted`` residuals, of the shape of x (n, k, ...), and by trial
+            ``action``, ``index``, ``names`` and ``times``.
         action_labels: Labels of the entries of the action, with their units; none where
             the action is only the trial's number.
         channel_names: Names of the entries of x without a time axis.
-        added: Name of what the augmented model adds.
 
     Returns:
         The figure.
     """
-    rows = [(before, "bare model", BEFORE)]
-    if after is not None:
-        rows.append((after, f"with {added}", AFTER))
-    shown = min(len(action_labels), 3)
-    several = before.x[0].size > 1
-    columns = shown + 1 + several
-    figure, axes = _subplots(len(rows), columns, width=3.3, height=2.5)
-    for line, (residuals, title, color) in zip(axes, rows, strict=True):
+    first, shown = next(iter(rows.values())), min(len(action_labels), 3)
+    several = first.refitted[0].size > 1
+    figure, axes = _subplots(len(rows), shown + 1 + several, width=3.3, height=2.5)
+    colors = BEFORE, AFTER
+    for line, (title, residuals), color in zip(
+        axes, rows.items(), colors, strict=False
+    ):
         each = residuals.refitted.reshape(len(residuals.index), -1)
         for i in range(shown):
             _scatter(line[i], residuals.action[:, i], each, color)
@@ -94,47 +58,52 @@ def plot_residuals(
     return figure
 
 
-def plot_before_after(evaluation: Evaluation) -> Figure:
+def plot_scores(
+    scores: Mapping[str, tuple[Array, Array]],
+    *,
+    errors: Collection[str],
+    levels: Mapping[str, float],
+) -> Figure:
     """Draw every score of every scored trial before and after, paired.
 
     Args:
-        evaluation: Scores on trials used neither to fit nor to choose.
+        scores: Scores of each trial, shape (2, s), before and after, and those over all
+            trials, shape (2,), by their titles.
+        errors: Titles of those that are errors, whose axis begins at zero.
+        levels: Values that scores should have, by title.
 
     Returns:
         The figure.
     """
-    metrics = [name for name in METRICS if name in evaluation.before]
-    figure, axes = _subplots(1, len(metrics), width=2.5, height=2.7)
-    for ax, name in zip(axes[0], metrics, strict=True):
-        pairs = np.stack([evaluation.before[name], evaluation.after[name]])
+    figure, axes = _subplots(1, len(scores), width=2.5, height=2.7)
+    for ax, (title, (pairs, total)) in zip(axes[0], scores.items(), strict=True):
         ax.plot([0, 1], pairs, color=FAINT, lw=0.8, alpha=0.7, zorder=1)
-        total = evaluation.table[evaluation.table["metric"] == name]
-        for x, (when, color) in enumerate((("before", BEFORE), ("after", AFTER))):
+        for x, color in enumerate((BEFORE, AFTER)):
             places = np.full(pairs.shape[1], x)
             ax.plot(places, pairs[x], ".", ms=5, color=color, alpha=0.6)
-            ax.plot([x] * len(total), total[when], "k_", ms=22, mew=2, zorder=3)
-        if name in ("rmse", "energy score"):
+            ax.plot(x, total[x], "k_", ms=22, mew=2, zorder=3)
+        if title in errors:
             positive = pairs[np.isfinite(pairs) & (pairs > 0)]
             is_wide = positive.size and positive.max() > 10 * positive.min()
             ax.set(yscale="log") if is_wide else ax.set_ylim(bottom=0)
-        if name == "log predictive density" and np.nanmin(pairs) < -200:
+        elif np.nanmin(pairs) < -200:
             ax.set_yscale("symlog", linthresh=10)
-        if name == "coverage":
-            ax.axhline(0.9, color="#333333", lw=0.8, ls=":")
-            ax.set_ylim(-0.04, 1.04)
+        if title in levels:
+            ax.axhline(levels[title], color="#333333", lw=0.8, ls=":")
+            ax.set_ylim(-0.04, 1.04)  # of a share
         ax.set(xlim=(-0.5, 1.5), xticks=[0, 1], xticklabels=["before", "after"])
-        ax.set_title(METRICS[name], fontsize=9)
+        ax.set_title(title, fontsize=9)
         _plain(ax)
     return figure
 
 
 def _by_entry(
-    ax: Axes, residuals: Residuals, color: str, channel_names: Sequence[str] | None
+    ax: Axes, residuals: Any, color: str, channel_names: Sequence[str] | None
 ) -> None:
     """Draw one line a trial over time, or points over the channels."""
     each = residuals.refitted.reshape(len(residuals.index), -1)
     if residuals.times is not None:
-        length = residuals.x.shape[1]
+        length = residuals.refitted.shape[1]
         times = np.broadcast_to(residuals.times, (len(each), length))
         for time, z in zip(times, residuals.refitted, strict=True):
             for channel in z.reshape(length, -1).T:
@@ -156,7 +125,7 @@ def _scatter(ax: Axes, place: Array, each: Array, color: str) -> None:
     ax.plot(place, each, ".", ms=3 if many else 7, alpha=0.45 if many else 0.9, c=color)
 
 
-def _trial_axis(ax: Axes, residuals: Residuals) -> None:
+def _trial_axis(ax: Axes, residuals: Any) -> None:
     """Name the trials, or number them where they are many or have no names."""
     index, names = residuals.index, residuals.names
     ax.set_xlabel("trial")

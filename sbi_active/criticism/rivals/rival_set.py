@@ -18,7 +18,15 @@ from sbi_active.criticism.data.measurements import Measurements
 from sbi_active.criticism.data.trials import Trials
 from sbi_active.criticism.effects.augmented import AugmentedSimulator
 from sbi_active.criticism.effects.effect import Effect
-from sbi_active.criticism.evidence.fit import (
+from sbi_active.criticism.results import SCATTER, UNEXPLAINED, Evidence, ModelKey
+from sbi_active.criticism.rivals.coordinates import SearchCoordinates
+from sbi_active.criticism.rivals.error_models import (
+    LARGEST,
+    NoiseGrid,
+    declared_noise,
+    sizes,
+)
+from sbi_active.criticism.rivals.fit import (
     NESTED,
     STEPS,
     THOROUGH,
@@ -26,10 +34,6 @@ from sbi_active.criticism.evidence.fit import (
     look_for_jumps,
     settings_of,
 )
-from sbi_active.criticism.results import SCATTER, UNEXPLAINED, Evidence, ModelKey
-from sbi_active.criticism.rivals.coordinates import SearchCoordinates
-from sbi_active.criticism.rivals.error_models import NoiseGrid
-from sbi_active.criticism.rivals.noise_grid import declared_noise, scattered
 from sbi_active.criticism.rivals.residual_process import ResidualProcess
 from sbi_active.criticism.rivals.rival import Rival
 from sbi_active.criticism.rivals.trial_simulator import NUM_REPLICATES, TrialSimulator
@@ -168,7 +172,7 @@ class RivalSet:
         self, error: str | None, suspect: int | None
     ) -> NoiseGrid | ResidualProcess:
         if error == SCATTER:
-            return scattered(self.noise)
+            return self.noise.scaled(np.hypot(1, sizes(LARGEST)))
         if error == UNEXPLAINED:
             return self._process
         if error is None or suspect is None:
