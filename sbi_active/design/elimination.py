@@ -18,6 +18,7 @@ from sbi_active.design.estimators.base import (
     InformationGainEstimator,
     standard_error,
 )
+from sbi_active.design.estimators.entropy import EntropyGain
 from sbi_active.design.estimators.model_index import RivalSampler
 from sbi_active.design.limits import DesignLimits
 from sbi_active.design.outcomes import JointLikelihood, conditional_gain
@@ -194,10 +195,10 @@ class GainEvaluator:
             search: Search that maximizes it.
             budget: Simulations of the design.
             num_samples: Simulations a candidate on average.
-            share: An evaluation has one of so many shares of these; of a fourth as many
-                its errors are twice as large.
+            share: An evaluation has one of so many shares of these, but as many as the
+                estimator needs; of a fourth as many its errors are twice as large.
         """
-        num = max(8, num_samples // share // 4 * 4)
+        num = max(self._least(num_samples // 2), num_samples // share // 4 * 4)
 
         def evaluate(action: Tensor) -> Evaluations:
             self.sampler.rewind()
@@ -217,6 +218,11 @@ class GainEvaluator:
             seed=derive_seed(self.seed, "search"),
             min_probability_valid=self.limits.least,
         )
+
+    def _least(self, most: int) -> int:
+        """Return the simulations that an estimate needs, at most so many."""
+        needed = (self.chosen or EntropyGain).fewest  # by which one is chosen
+        return max(8, min(needed, most // 4 * 4))
 
     def eliminate(
         self,
@@ -247,7 +253,8 @@ class GainEvaluator:
             return min(num, each // 4 * 4)
 
         # Slopes that a search had may have spent what was the finalists'.
-        size = max(8, affordable(int(share * num_samples) // 4 * 4, num_actions))
+        size = max(int(share * num_samples), 2 * self._least(num_samples // 2))
+        size = max(8, affordable(size // 4 * 4, num_actions))
         first = self.draw(size, action, halves=True)
         said = [*(self.notes or ()), *self.estimator.remarks(first)]
         halves = _halves(first)

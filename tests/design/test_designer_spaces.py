@@ -2,6 +2,7 @@
 
 import pytest
 import torch
+from sbi.utils import BoxUniform
 from torch.distributions import MultivariateNormal
 
 from sbi_active import (
@@ -82,7 +83,7 @@ def test_evaluations_share_parameters_and_noise_from_call_to_call():
     assert design.candidates[:, 0].tolist() == [1.0, 2.0]
     # what compares and reports is fresh
     assert not torch.equal(first.utility, design.expected_information_gain)
-    assert design.num_simulations == int(design.num_samples.sum()) + 4 * 16
+    assert design.num_simulations == int(design.num_samples.sum()) + 4 * 20
 
 
 def test_slopes_in_a_search_leave_its_finalists_simulations():
@@ -97,3 +98,27 @@ def test_slopes_in_a_search_leave_its_finalists_simulations():
     design = designer.select(None, model, belief=prior, seed=0)
     assert design.expected_information_gain.isfinite().all()
     assert int(design.num_samples.min()) >= 8
+
+
+def test_a_search_for_a_parameter_sees_it_by_few_simulations():
+    def bump(theta, action):
+        strength = torch.exp(-8 * (action[:, :1] - 0.7) ** 2)
+        return torch.cat([theta[:, :1] * strength, theta[:, 1:] * action[:, 1:]], 1)
+
+    noise, names = GaussianNoise(0.1), ("bump", "slope")
+    model = SimulatorModel(bump, noise=noise, parameter_names=names)
+    prior = BoxUniform(torch.zeros(2), torch.ones(2))
+    square = BoxActions([0.0, 0.0], [1.0, 1.0])
+    for seed in range(2):
+        designer = InformationGainDesigner(square, num_samples=64)
+        design = designer.select(None, model, belief=prior, target="bump", seed=seed)
+        assert abs(float(design.action[0]) - 0.7) < 0.15
+        assert float(design.expected_information_gain.max()) > 0.3
+        assert design.notes == ()
+
+
+def test_an_estimate_by_too_few_outcomes_is_said_to_be_one():
+    model = SimulatorModel(simulator, parameter_names=("a", "b"))
+    designer = InformationGainDesigner(DiscreteActions([1.0, 2.0]), num_samples=16)
+    design = designer.select(None, model, belief=PRIOR, target="a", seed=0)
+    assert any("outcomes of an action; raise num_samples" in n for n in design.notes)

@@ -120,11 +120,13 @@ class InformationGainEstimator(Shown, ABC):
             the model.
         needs_noise: Whether it uses the declared noise, or else replicates.
         needs_model: Whether it uses something learned.
+        fewest: Outcomes of a candidate that an estimate needs.
     """
 
     bound: Bound = "none"
     needs_noise: bool = False
     needs_model: bool = True
+    fewest: int = 8
 
     def __call__(
         self,

@@ -47,7 +47,8 @@ def by_pattern(
     """Yield outcomes that count by which of their numbers are present.
 
     Each group has a candidate's number, rows (k,), the numbers present (p,) and their
-    values (k, p); patterns of fewer rows than the smallest join those without a number.
+    values (k, p); patterns of fewer rows than the smallest, but for one of all rows,
+    join those without a number.
     """
     for a, counted in enumerate(simulations.counted):
         x = simulations.x[a].flatten(1).double()
@@ -57,7 +58,7 @@ def by_pattern(
         for k, pattern in enumerate(patterns):
             members = rows[label == k]
             columns = torch.nonzero(pattern)[:, 0]
-            if len(columns) and len(members) >= smallest:
+            if len(columns) and len(members) >= min(smallest, len(rows)):
                 yield a, members, columns, x[members][:, columns]
             else:
                 rest.append(members)

@@ -61,6 +61,7 @@ class EntropyGain(InformationGainEstimator):
 
     needs_noise = True
     needs_model = False
+    fewest = 20
 
     def __init__(self, *, num_neighbors: int = 4) -> None:
         self.num_neighbors = at_least(num_neighbors, 1, "num_neighbors", 4)
@@ -275,7 +276,7 @@ def random_presence(simulations: CandidateSimulations) -> Tensor:
 def problems_of_noise(
     simulations: CandidateSimulations,
     *,
-    few: int = 20,
+    few: int = EntropyGain.fewest,
     max_partly: float = 0.1,
     significant: float = 4.0,
     max_kurtosis: float = 0.3,

@@ -178,6 +178,7 @@ class ModelIndexGain(InformationGainEstimator):
 
     def __init__(self, probability: Tensor, *, few: int = 16) -> None:
         self.probability, self.few = probability.double(), few
+        self.fewest = 4 * few
 
     def _contributions(
         self, model: Any, simulations: CandidateSimulations, belief: Distribution | None
@@ -188,7 +189,7 @@ class ModelIndexGain(InformationGainEstimator):
         gain = torch.full(simulations.x.shape[:2], torch.nan, dtype=torch.float64)
         block = _blocks(simulations, index, len(self.probability))
         known = [p for p in (simulations.mean, simulations.sd) if p is not None]
-        for a, rows, columns, x in by_pattern(simulations, 4 * self.few):
+        for a, rows, columns, x in by_pattern(simulations, self.fewest):
             noise = [p[a].flatten(1)[rows][:, columns].double() for p in known]
             given = x, noise, rows, simulations.counted[a], index, block
             gain[a, rows] = weight[rows] * self._score(*given)

@@ -53,7 +53,7 @@ class ParameterGain(InformationGainEstimator):
             for it, (n, k); None are all.
         num_marginal: Number of draws of the belief for the marginal of the target; of a
             tenth its entropy has an error of .03 nat, common to all candidates.
-        few: Outcomes of one pattern whose numbers are not used.
+        few: Outcomes of one pattern among others whose numbers are not used.
 
     References:
         Barber & Agakov, NeurIPS 2003; Foster et al., NeurIPS 2019 (variational bounds
@@ -71,7 +71,7 @@ class ParameterGain(InformationGainEstimator):
         few: int = 24,
     ) -> None:
         self.target = target or (lambda theta: theta)
-        self.num_marginal, self.few = num_marginal, few
+        self.num_marginal, self.fewest = num_marginal, few
         self._marginal: tuple[Distribution, QuantileTransformer, float] | None = None
 
     def _contributions(
@@ -93,12 +93,18 @@ class ParameterGain(InformationGainEstimator):
         u = torch.from_numpy(scores.transform(theta))
         shape = simulations.x.shape[:2]
         gain = torch.full(shape, torch.nan, dtype=torch.float64)
-        for a, rows, _, x in by_pattern(simulations, self.few):
+        for a, rows, _, x in by_pattern(simulations, self.fewest):
             if len(rows) < 8:  # no density to fit: nothing is learned
                 gain[a, rows] = -dependence
                 continue
             gain[a, rows] = _score(u[rows], x) - log_normal(u[rows]) - dependence
         return gain
+
+    def cautions(self, gain: Tensor) -> list[str]:
+        """Return a caution where a candidate has too few outcomes to fit to."""
+        num = gain.shape[1]
+        few = f"ParameterGain rests on {num} outcomes of an action; raise num_samples"
+        return [few] if num < self.fewest else []
 
 
 def _score(u: Tensor, x: Tensor) -> Tensor:
