@@ -9,7 +9,8 @@ import torch
 from torch import Tensor
 
 from sbi_active.arrays import Array
-from sbi_active.design.design import action_labels, draw
+from sbi_active.design.design import action_labels
+from sbi_active.display.panels import plot_design
 from sbi_active.display.table import within
 from sbi_active.seeding import derive_seed, forked_generators
 
@@ -168,7 +169,7 @@ def _draw_actions(ax: Axes, campaign: Any) -> None:
         ax.plot([t.index for t in trials], [t.action.tolist() for t in trials], "o")
         return
     if len(labels) > 1:
-        draw(designed[-1].design, ax)
+        plot_design(designed[-1].design, ax)
         ax.set_title(f"information by action, trial {designed[-1].index}", fontsize=10)
         return
     from matplotlib import colormaps
