@@ -10,10 +10,12 @@ from typing import ClassVar
 
 import torch
 from attrs import frozen
+from scipy.optimize import minimize
 from torch import Tensor
 from typing_extensions import override
 
 from sbi_active.actions import ActionSpace
+from sbi_active.arrays import Array
 from sbi_active.design.coordinates import Coordinates
 from sbi_active.expected import Shown
 from sbi_active.inference.sampling.gaussian_process import IN_CUBE, GaussianProcess
@@ -265,12 +267,11 @@ class GradientSearch(Search):
 
 
 def ascended(
-    score: Score, start: Tensor, objective: Objective, *, num_steps: int = 24
+    score: Score, start: Tensor, objective: Objective, *, num_steps: int = 20
 ) -> Tensor:
     """Return points that rose from permitted starts (s, dim), shape (s, dim).
 
-    A step along the gradient that is permitted and rises makes the next longer; another
-    is not taken, and the next is shorter.
+    A point that left what is permitted goes back to its edge, on the line to its start.
 
     Args:
         score: Score of points (s, dim), differentiable in the first entries, shape
@@ -280,16 +281,29 @@ def ascended(
         num_steps: Number of steps.
     """
     c = objective.space.num_continuous
-    point, size = start, torch.full((len(start), 1), 0.1).double()
-    for _ in range(num_steps):
-        with torch.enable_grad():
-            at = point.clone().requires_grad_()
-            value = score(at)
-            (slope,) = torch.autograd.grad(value.sum(), at)
-        slope = torch.nn.functional.normalize(slope[:, :c], dim=1)
-        moved = point.clone()
-        moved[:, :c] = (point[:, :c] + size * slope).clamp(0, 1)
-        rises = ((score(moved) > value) & objective.allows(moved))[:, None]
-        point = torch.where(rises, moved, point)
-        size = size * torch.where(rises, 1.5, 0.4)
-    return point
+    fixed = start[:, c:]
+
+    def fall(flat: Array) -> tuple[float, Array]:
+        u = torch.tensor(flat.reshape(-1, c), requires_grad=True)
+        total = -score(torch.cat([u, fixed], 1)).sum()
+        return float(total.detach()), torch.autograd.grad(total, u)[0].flatten().numpy()
+
+    first = start[:, :c].flatten().numpy()
+    with torch.enable_grad():
+        found = minimize(
+            *(fall, first),
+            jac=True,
+            method="L-BFGS-B",
+            bounds=[(0.0, 1.0)] * len(first),
+            options={"maxiter": num_steps},
+        )
+    end = torch.cat([torch.from_numpy(found.x).reshape(-1, c), fixed], 1)
+    inside = torch.where(objective.allows(end)[:, None], end, start)
+    for _ in range(10):  # a thousandth of the way
+        middle = 0.5 * (inside + end)
+        allowed = objective.allows(middle)[:, None]
+        inside, end = (
+            torch.where(allowed, middle, inside),
+            torch.where(allowed, end, middle),
+        )
+    return inside
