@@ -72,7 +72,7 @@ def find_contradiction(
     likelihood: SimulatedLikelihood,
     theta: Tensor,
     residual: Array,
-    jacobian: Array | None = None,
+    jacobian: Array,
     *,
     rng: np.random.Generator,
     informed_above: float = 1e-3,
@@ -84,24 +84,20 @@ def find_contradiction(
         theta: Best fit, then parameters around it, shape (n, d).
         residual: Whitened residuals at the best fit, shape (N,), 0 where not observed.
         jacobian: Derivatives of the residuals in coordinates of a standard normal
-            prior, (N, d); None counts every parameter, and infers no inflation from
-            their spread.
+            prior, (N, d).
         rng: Source of the draws of the noise.
         informed_above: Derivative below which no trial informs a parameter.
     """
     t = len(likelihood)
     squares = (residual.reshape(t, -1) ** 2).sum(1)
-    informed = theta.shape[1]
-    if jacobian is not None:
-        informed = int((np.abs(jacobian).max(0) > informed_above).sum())
     found = compared(
         *(likelihood.action, likelihood.x, likelihood.noise.whiten),
         squares,
-        num_fitted=informed,
+        num_fitted=int((np.abs(jacobian).max(0) > informed_above).sum()),
     )
     if found is None or not _beyond_noise(likelihood, theta, rng):
         return None
-    if t == 1 or jacobian is None:
+    if t == 1:
         return found
     d = jacobian.shape[1]
     precision = jacobian.T @ jacobian + np.eye(d)

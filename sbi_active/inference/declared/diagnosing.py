@@ -87,7 +87,7 @@ def diagnose_fit(
         figures={
             "likelihood": "simulated",
             "method": fit.method,
-            "num_stages": len(fit.pool.proposals),
+            "num_stages": fit.num_stages,
             "num_modes": 0 if found is None else len(found.modes),
             "num_uninformed": int(fit.free.sum()),
             "log_evidence": fit.log_evidence,
