@@ -26,7 +26,7 @@ from sbi_active.criticism.linear.mixture import integrated
 from sbi_active.criticism.linear.model import LinearModel
 from sbi_active.criticism.results import NONE
 from sbi_active.criticism.steps.detection import log_prior, log_priors
-from sbi_active.inference.sampling.truncated import draws_between
+from sbi_active.inference.sampling.mixtures import draws_between
 from sbi_active.inference.sampling.weights import log_sum_exp, normalized, systematic
 
 EffectSet = frozenset[int]

@@ -13,11 +13,11 @@ from torch.distributions import Distribution
 
 from sbi_active.arrays import Array
 from sbi_active.inference.beliefs.weighted import WeightedBelief
-from sbi_active.inference.declared.contradiction import (
+from sbi_active.inference.declared.diagnosing import (
     Contradiction,
+    diagnose_fit,
     find_contradiction,
 )
-from sbi_active.inference.declared.diagnosing import diagnose_fit
 from sbi_active.inference.declared.settings import RefinementOptions
 from sbi_active.inference.engine import (
     Fit,
