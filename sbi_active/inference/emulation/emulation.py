@@ -26,6 +26,7 @@ from sbi_active.inference.emulation.checks import (
 )
 from sbi_active.inference.emulation.emulator import EmulatedLikelihood, emulated
 from sbi_active.inference.emulation.gains import mixture_gain
+from sbi_active.inference.emulation.outcomes import Summary
 from sbi_active.inference.emulation.pool import (
     EmulatedTrial,
     Pool,
@@ -46,7 +47,6 @@ from sbi_active.inference.emulation.stages import (
     Stage,
     largest_error,
 )
-from sbi_active.inference.emulation.summaries import Summary
 from sbi_active.inference.engine.importance import fitted
 from sbi_active.inference.engine.learned import (
     LearnedBelief,
