@@ -40,9 +40,12 @@ from scipy.optimize import minimize
 from scipy.special import gammaln, logsumexp
 
 from sbi_active.inference.emulation.gains import correlation_root
-from sbi_active.inference.emulation.outcomes import TrialOutcome
+from sbi_active.inference.emulation.outcomes import (
+    Statistic,
+    TrialOutcome,
+    learned_statistic,
+)
 from sbi_active.inference.emulation.solving import whole_space
-from sbi_active.inference.emulation.summaries import Statistic, learned_statistic
 from sbi_active.inference.sampling.gaussian_process import (
     GaussianProcess,
     ProcessSettings,

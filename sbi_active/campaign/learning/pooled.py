@@ -25,9 +25,9 @@ from sbi_active.design.limits import DesignLimits
 from sbi_active.identifiability.known import note_combinations
 from sbi_active.inference.emulation.emulation import Emulation
 from sbi_active.inference.emulation.gains import candidate_gains
+from sbi_active.inference.emulation.outcomes import Summary, fitted_summaries
 from sbi_active.inference.emulation.pool import EmulatedTrial, Pool
 from sbi_active.inference.emulation.stages import FEW_ROWS
-from sbi_active.inference.emulation.summaries import Summary, fitted_summaries
 from sbi_active.inference.sampling.coordinates import PriorCoordinates
 from sbi_active.seeding import derive_seed, forked_generators
 from sbi_active.simulation import SimulatorModel, simulate

@@ -31,7 +31,7 @@ from sbi_active.criticism.linear.processes import Grams, Processes
 from sbi_active.criticism.results import NONE
 from sbi_active.criticism.rivals.error_models import drawn
 from sbi_active.criticism.steps.detection import log_prior, log_priors
-from sbi_active.inference.sampling.truncated import draws_between
+from sbi_active.inference.sampling.mixtures import draws_between
 from sbi_active.inference.sampling.weights import log_sum_exp, normalized, systematic
 
 TINY = 1e-300  # keeps logarithms finite

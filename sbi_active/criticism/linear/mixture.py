@@ -9,7 +9,7 @@ import numpy as np
 
 from sbi_active.arrays import Array
 from sbi_active.criticism.linear.model import LinearModel
-from sbi_active.inference.sampling.truncated import log_inside
+from sbi_active.inference.sampling.mixtures import log_inside
 from sbi_active.inference.sampling.weights import log_sum_exp
 
 #: Factors on the scale of an effect's prior, equally likely.

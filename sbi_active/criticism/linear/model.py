@@ -15,8 +15,8 @@ from sbi_active.criticism.effects.effect import Effect
 from sbi_active.criticism.results import ModelKey
 from sbi_active.criticism.rivals.error_models import LOG_2PI, student
 from sbi_active.criticism.rivals.rival import Rival
-from sbi_active.inference.sampling.eigen import eigh
 from sbi_active.inference.sampling.least_squares import within
+from sbi_active.inference.sampling.mixtures import eigh
 
 #: What a linear model has one of for each coordinate.
 COORDINATES = ("u", "center", "sd", "scaled", "low", "high", "trial_of")

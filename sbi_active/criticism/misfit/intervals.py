@@ -35,7 +35,7 @@ from sbi_active.criticism.linear.left_out import Candidate
 from sbi_active.criticism.linear.mixture import WIDTHS, summed
 from sbi_active.criticism.linear.model import LinearModel
 from sbi_active.criticism.linear.processes import Filter, Processes, alike
-from sbi_active.inference.sampling.eigen import eigh
+from sbi_active.inference.sampling.mixtures import eigh
 
 
 def covariance(own: Candidate, errors: Errors, action: Array) -> Array:

@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 from sbi_active.arrays import Array
 from sbi_active.criticism.data.measurements import Measurements
 from sbi_active.criticism.rivals.error_models import LOG_2PI, NoiseGrid, drawn
-from sbi_active.inference.sampling.eigen import eigh
+from sbi_active.inference.sampling.mixtures import eigh
 from sbi_active.inference.sampling.weights import log_sum_exp
 
 #: Length scales, in ranges of the action space: a local and a global misfit.

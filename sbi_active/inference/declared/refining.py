@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -13,11 +13,11 @@ from torch.distributions import Distribution
 
 from sbi_active.arrays import Array
 from sbi_active.inference.beliefs.weighted import WeightedBelief
-from sbi_active.inference.declared.contradiction import (
+from sbi_active.inference.declared.diagnosing import (
     Contradiction,
+    diagnose_fit,
     find_contradiction,
 )
-from sbi_active.inference.declared.diagnosing import diagnose_fit
 from sbi_active.inference.declared.settings import RefinementOptions
 from sbi_active.inference.engine import (
     Fit,
@@ -27,8 +27,6 @@ from sbi_active.inference.engine import (
     infer,
     search,
 )
-from sbi_active.inference.engine.infer import share_cut
-from sbi_active.inference.engine.pool import Pool
 from sbi_active.inference.engine.potential import (
     MeanTable,
     SimulatedLikelihood,
@@ -45,7 +43,7 @@ from sbi_active.inference.sampling.coordinates import (
     PriorCoordinates,
 )
 from sbi_active.inference.sampling.mixtures import fitted_normals
-from sbi_active.inference.sampling.weights import normalized, systematic
+from sbi_active.inference.sampling.weights import systematic
 from sbi_active.seeding import derive_seed, forked_generators
 
 
@@ -74,29 +72,18 @@ class Problem:
 
 @dataclass(frozen=True)
 class DeclaredRecord:
-    """The record that a belief goes on from when a further trial is known.
+    """The record that saves simulations when a further trial is known.
 
     Attributes:
-        trials: Actions and outcomes in the likelihood of the draws.
-        coordinates: Coordinates that they are in.
+        coordinates: Coordinates of the prior.
         table: Noise-free outcomes so far.
-        pool: The draws.
+        screened: Draws of the prior that the search looked at first, shape (n, d); None
+            if it got nowhere.
     """
 
-    trials: tuple[Tensor, Tensor]
     coordinates: NormalCoordinates
     table: MeanTable
-    pool: Pool
-
-    def leads_to(self, simulator: Any, action: Tensor, x: Tensor) -> bool:
-        """Return whether its trials are the first of these, of the same simulator."""
-        t = len(self.trials[0])
-        return (
-            self.table.simulator is simulator
-            and torch.equal(self.trials[0], action[:t])
-            and torch.equal(self.trials[1].nan_to_num(), x[:t].nan_to_num())
-            and torch.equal(self.trials[1].isnan(), x[:t].isnan())
-        )
+    screened: Array | None
 
 
 class SimulatedBelief(WeightedBelief):
@@ -175,8 +162,7 @@ def refine_declared(problem: Problem, past: object) -> SimulatedBelief | None:
 
     Args:
         problem: Problem, whose simulator is deterministic beside a declared noise.
-        past: State of an earlier call: draws to go on from, and what needs no
-            simulation.
+        past: Record of an earlier call, whose rows are not simulated again.
 
     Returns:
         None for another simulator.
@@ -191,14 +177,12 @@ def refine_declared(problem: Problem, past: object) -> SimulatedBelief | None:
     if not declares_noise(simulator, few, action[:1].expand(len(few), -1)):
         return None
     rng = np.random.default_rng(derive_seed(seed, "declared"))
-    before = past if isinstance(past, DeclaredRecord) else None
-    if before is not None and before.leads_to(simulator, action, x):
-        coordinates, table = before.coordinates, before.table
+    if isinstance(past, DeclaredRecord) and past.table.simulator is simulator:
+        coordinates, table, screened = past.coordinates, past.table, past.screened
         table.workers = settings.workers
     else:
-        before = None
         coordinates = NormalCoordinates(PriorCoordinates(prior, rng), rng)
-        table = MeanTable(simulator, settings.workers)
+        table, screened = MeanTable(simulator, settings.workers), None
     own = Settings(
         num_effective=settings.num_effective,
         num_simulations=3 * settings.num_histories * len(action),
@@ -208,23 +192,22 @@ def refine_declared(problem: Problem, past: object) -> SimulatedBelief | None:
     spent = table.num_simulations, table.num_missing
     declared = SimulatedLikelihood(table, action, x)
     potential = SimulatedPotential(declared, coordinates)
-    contradiction, fit = None, None
-    if before is not None:
-        fit = _gone_on(before.pool, potential, own, rng)
-    if fit is None:
-        near = _near(problem.hints, coordinates, seed)
-        potential, found, contradiction = _searched(potential, near, own, rng)
-        fit = infer(potential, rng, found=found, near=near, settings=own)
+    near = _near(problem.hints, coordinates, seed)
+    first = None if near is None else near[:2]
+    found = search(potential, rng, first, own.search, screened=screened)
+    if found is not None:
+        screened = found.screened[: own.search.num_screened]
+    potential, found, contradiction = _inflated(potential, found, own, rng)
+    fit = infer(potential, rng, found=found, near=near, settings=own)
     if not len(fit.u):
         raise UnexplainedOutcomeError(NOTHING_EXPLAINS)
     belief = SimulatedBelief(prior, potential, fit, defensive=settings.defensive)
-    known, pool = diagnose_fit(fit, potential, declared, seed), fit.pool
-    if contradiction is not None:  # the likelihood of the draws is of another noise
+    known = diagnose_fit(fit, potential, declared, seed)
+    if contradiction is not None:
         known = contradiction.noted(known)
-        pool = Pool.empty(potential.dim, len(action))
     num, missing = table.num_simulations - spent[0], table.num_missing - spent[1]
     belief.diagnostics = known.extended(num_simulations=num, num_missing=missing)
-    belief.histories = DeclaredRecord((action, x), coordinates, table, pool)
+    belief.histories = DeclaredRecord(coordinates, table, screened)
     warn_missing(missing, num, "their draws")
     return belief
 
@@ -244,39 +227,9 @@ def _near(
     return np.concatenate([*[u[:1] for u in drawn], *[u[1:] for u in drawn]])
 
 
-def _gone_on(
-    past: Pool,
+def _inflated(
     potential: SimulatedPotential,
-    own: Settings,
-    rng: np.random.Generator,
-) -> Fit | None:
-    """Return the posterior from draws of the earlier trials; None if it fails."""
-    pool = past.with_trials(potential, own)
-    if not len(pool.u):
-        return None
-    weight = normalized(pool.log_mixture_weight)
-    rows = [weight.argmax(), *systematic(weight, own.num_near - 1, rng.random())]
-    again = replace(own.search, num_screened=0)
-    found = search(potential, rng, pool.u[rows], again)
-    if found is not None and share_cut(potential, found) > own.hopeless:
-        return None
-    fit = infer(potential, rng, past=pool, found=found, settings=own)
-    is_heavy = fit.tail_shape > own.largest_shape
-    if fit.effective_sample_size < own.num_effective or is_heavy:
-        return None
-    best = fit.u[[fit.log_likelihood.argmax()]]
-    contradicted = find_contradiction(
-        potential.likelihood,
-        potential.coordinates.to_theta(best),
-        potential.residual(best)[0][0],
-        rng=rng,
-    )
-    return fit if contradicted is None else None
-
-
-def _searched(
-    potential: SimulatedPotential,
-    near: Array | None,
+    found: Found | None,
     own: Settings,
     rng: np.random.Generator,
     *,
@@ -285,15 +238,14 @@ def _searched(
     wide: float = 3.0,
     stable: float = 1.1,
 ) -> tuple[SimulatedPotential, Found | None, Contradiction | None]:
-    """Return the modes, of a noise that is inflated where trials contradict.
+    """Return the modes of a noise that is inflated where trials contradict.
 
     Heavy tails have their best fit among ``num_around`` places, ``wide`` times the
     width of a mode around it; below ``stable`` the inflation is settled. It is found at
     most ``max_inflations`` times: once the noise is wider, a better fit may be found.
     """
     declared, c = potential.likelihood, potential.coordinates
-    points = None if near is None else near[:2]
-    found, contradiction = search(potential, rng, points, own.search), None
+    contradiction = None
     for _ in range(max_inflations):
         if found is None:
             break

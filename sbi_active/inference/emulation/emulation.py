@@ -16,7 +16,7 @@ import torch
 from torch.distributions import Distribution
 
 from sbi_active.arrays import Array
-from sbi_active.inference.declared.contradiction import Contradiction, compared
+from sbi_active.inference.declared.diagnosing import Contradiction, compared
 from sbi_active.inference.declared.settings import RefinementOptions
 from sbi_active.inference.emulation.checks import (
     Fresh,
@@ -26,6 +26,7 @@ from sbi_active.inference.emulation.checks import (
 )
 from sbi_active.inference.emulation.emulator import EmulatedLikelihood, emulated
 from sbi_active.inference.emulation.gains import mixture_gain
+from sbi_active.inference.emulation.outcomes import Summary
 from sbi_active.inference.emulation.pool import (
     EmulatedTrial,
     Pool,
@@ -41,9 +42,11 @@ from sbi_active.inference.emulation.regression import (
 )
 from sbi_active.inference.emulation.residuals import ShapeSettings
 from sbi_active.inference.emulation.solving import Region, around, whole_space
-from sbi_active.inference.emulation.stages import EmulationSettings, Stage
-from sbi_active.inference.emulation.summaries import Summary
-from sbi_active.inference.emulation.weighing import largest_error
+from sbi_active.inference.emulation.stages import (
+    EmulationSettings,
+    Stage,
+    largest_error,
+)
 from sbi_active.inference.engine.importance import fitted
 from sbi_active.inference.engine.learned import (
     LearnedBelief,

@@ -24,12 +24,11 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from sbi_active.arrays import Array
-from sbi_active.inference.emulation.outcomes import TrialOutcome
+from sbi_active.inference.emulation.outcomes import TrialOutcome, learned_statistic
 from sbi_active.inference.emulation.pool import TrialRows
 from sbi_active.inference.emulation.regression import Regression, fewest_rows
 from sbi_active.inference.emulation.residuals import ShapeSettings
 from sbi_active.inference.emulation.solving import Region
-from sbi_active.inference.emulation.summaries import learned_statistic
 from sbi_active.inference.rounds.rows import UnexplainedOutcomeError
 from sbi_active.inference.sampling.coordinates import PriorCoordinates
 from sbi_active.inference.sampling.gaussian_process import (

@@ -21,13 +21,13 @@ from torch import Tensor
 
 from sbi_active.arrays import Array
 from sbi_active.inference.emulation.emulator import interpolated
-from sbi_active.inference.emulation.pool import Pool
-from sbi_active.inference.emulation.solving import around
-from sbi_active.inference.emulation.summaries import (
+from sbi_active.inference.emulation.outcomes import (
     Summary,
     is_short,
     learned_statistic,
 )
+from sbi_active.inference.emulation.pool import Pool
+from sbi_active.inference.emulation.solving import around
 from sbi_active.inference.sampling.coordinates import PriorCoordinates
 from sbi_active.inference.sampling.gaussian_process import GaussianProcess
 from sbi_active.seeding import derive_seed

@@ -13,7 +13,7 @@ from torch import Tensor
 from torch.distributions import Distribution
 
 from sbi_active.arrays import Array
-from sbi_active.inference.emulation.summaries import Summary
+from sbi_active.inference.emulation.outcomes import Summary
 from sbi_active.inference.rounds.rows import rows_of
 from sbi_active.inference.sampling.coordinates import PriorCoordinates
 from sbi_active.simulation.outcomes import Outcome, Simulations

@@ -27,10 +27,10 @@ from sbi_active.inference.declared.refining import (
 )
 from sbi_active.inference.declared.settings import RefinementOptions
 from sbi_active.inference.emulation.emulation import Emulation
+from sbi_active.inference.emulation.outcomes import fitted_summaries
 from sbi_active.inference.emulation.pool import EmulatedTrial, Pool, noise_sds
 from sbi_active.inference.emulation.regression import fewest_rows
 from sbi_active.inference.emulation.stages import EmulationSettings
-from sbi_active.inference.emulation.summaries import fitted_summaries
 from sbi_active.inference.engine.learned import LearnedBelief
 from sbi_active.inference.rounds.rows import warn_missing
 from sbi_active.inference.sampling.coordinates import PriorCoordinates

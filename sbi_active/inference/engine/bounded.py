@@ -22,9 +22,8 @@ from numpy.typing import NDArray
 from sbi_active.arrays import Array
 from sbi_active.inference.engine.potential import Potential
 from sbi_active.inference.engine.search import Found
-from sbi_active.inference.sampling.mixtures import Proposal
+from sbi_active.inference.sampling.mixtures import Proposal, truncated_normal
 from sbi_active.inference.sampling.smc import Bridged, Moves, bridge
-from sbi_active.inference.sampling.truncated import truncated_normal
 from sbi_active.inference.sampling.weights import log_sum_exp
 
 Density = Callable[[Array], Array]

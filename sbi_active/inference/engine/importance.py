@@ -8,7 +8,7 @@ Each draw is weighted under the mixture of all proposals,
 Where few draws count, the next proposal is fitted to
 
 .. math::
-    p(u)\, L_{\mathrm{past}}(u)\, L_{\mathrm{new}}(u)^\beta
+    p(u)\, L(u)^\beta
 
 with the largest :math:`\beta` that leaves enough of them, up to 1: of a response that
 jumps, the draws of the prior are led to the posterior so.
@@ -73,8 +73,6 @@ class ImportanceSampling:
         num_components: Number of components of a proposal at most.
         settings: Numbers of draws.
         found: Modes, whose potential has residuals; None if there are none.
-        is_first: Whether the modes are all that are known, so that proposals along
-            ridges begin there; after a further trial the draws may know others.
 
     Attributes:
         num_full: Number of proposals fitted to the whole likelihood.
@@ -92,7 +90,6 @@ class ImportanceSampling:
     num_components: int
     settings: Settings
     found: Found | None = None
-    is_first: bool = True
     num_full: int = 0
     num_tempered: int = 0
     ridge: Ridge | None = None
@@ -108,7 +105,7 @@ class ImportanceSampling:
     @property
     def num_modes(self) -> float:
         """The number of modes, by the entropy of their weights; 1 along a ridge."""
-        if self.found is None or not self.is_first or self.ridge is not None:
+        if self.found is None or self.ridge is not None:
             return 1.0
         return float(np.exp(entr(self.found.guess.weights).sum()))
 
@@ -119,7 +116,7 @@ class ImportanceSampling:
         proposal, heavy, least = pool.final, 0, 0.0
         for _ in range(own.max_rounds):
             left = budget - (potential.num_simulations - start)
-            power = _largest_power(*self._logs(), own.fewest)
+            power = self._largest_power(own.fewest)
             effective = pool.effective_sample_size
             is_cheap = left > (1 - own.share_of_plenty) * budget and not self.is_rough
             divergence = self.num_modes * pool.divergence
@@ -145,16 +142,11 @@ class ImportanceSampling:
             is_good |= is_last and efficiency >= 0.5 * self.best > 0
             size = own.draws_of_fit(potential.dim)
             if proposal is not None and is_good and not is_heavy:
-                rows = (own.num_effective - effective) / efficiency * pool.num_trials
-                if pool.num_past and rows > left:
-                    return  # modes serve better than draws of fewer trials
                 least_size, most_size = 0.2 * own.num_draws, 4 * own.num_draws
                 size = int(np.clip(1.1 * missing, least_size, most_size))
             else:
                 if effective >= own.seen:
                     self.best = max(self.best, efficiency)
-                if pool.num_past and not self.best and self.num_full > own.max_fits:
-                    return  # modes are found again, and particles led from there
                 pool.restart()
                 proposal = self._fitted(power, efficiency)
             best = float((pool.log_prior + pool.log_likelihood).max())
@@ -181,10 +173,7 @@ class ImportanceSampling:
         share = own.share_if_rough if self.is_rough else own.share_of_wide
         self.num_full += power == 1
         self.num_tempered += power < 1
-        log_rest, log_new = self._logs()
-        weight = normalized(log_rest + power * log_new)
-        main = fitted(pool.u, weight, self.num_components, own, rng)
-        wide = self._wide()
+        main, wide = self._tempered(power, self.num_components), self._wide()
         if self.is_along is not None:
             self.efficiency[self.is_along] = efficiency
         self.is_along = False
@@ -192,7 +181,7 @@ class ImportanceSampling:
         is_early = self.num_full + self.num_tempered <= own.num_ridged
         known = self.efficiency
         is_better = known.get(True, 0.0) > known.get(False, np.inf)
-        if self.found is not None and self.is_first and (is_early or is_better):
+        if self.found is not None and (is_early or is_better):
             full = normalized(pool.log_mixture_weight)
             if self.ridge is not None:
                 self.ridge = self.ridge.grown(pool.u, full, rng)
@@ -235,17 +224,38 @@ class ImportanceSampling:
 
     def _wide(self) -> Proposal:
         """Return a proposal fitted to a power of the likelihood that leaves many."""
-        pool, own = self.pool, self.settings
-        log_rest = pool.log_prior - pool.log_mixture
-        flat = _largest_power(log_rest, pool.log_likelihood, own.broad)
-        weight = normalized(log_rest + flat * pool.log_likelihood)
-        return fitted(pool.u, weight, 2, own, self.rng)
+        return self._tempered(self._largest_power(self.settings.broad), 2)
 
-    def _logs(self) -> tuple[Array, Array]:
-        """Return log weights without the new likelihood, and that, shapes (n,)."""
+    def _tempered(self, power: float, num_components: int) -> Proposal:
+        """Return a proposal fitted to all draws by a power of the likelihood."""
         pool = self.pool
-        log_new = pool.log_likelihood - pool.log_past
-        return pool.log_prior + pool.log_past - pool.log_mixture, log_new
+        weight = normalized(
+            pool.log_prior - pool.log_mixture + power * pool.log_likelihood
+        )
+        return fitted(pool.u, weight, num_components, self.settings, self.rng)
+
+    def _largest_power(
+        self, needed: float, *, shrinks: float = 0.8, least: float = 1e-10
+    ) -> float:
+        """Return the largest power of the likelihood that leaves enough draws.
+
+        Downward from 1: where most draws are near the posterior, a few of the prior
+        outweigh them at lower powers, and fewer are effective there. Each power that is
+        tried is so much less than the last, down to the least.
+        """
+        log_rest = self.pool.log_prior - self.pool.log_mixture
+        needed = min(needed, 0.5 * effective_sample_size(log_rest))
+
+        def suffices(power: float) -> bool:
+            log_weight = log_rest + power * self.pool.log_likelihood
+            return effective_sample_size(log_weight) >= needed
+
+        high = 1.0
+        while high > least and not suffices(high):
+            high *= shrinks
+        if high == 1 or high <= least:
+            return max(high, least)
+        return largest_power(suffices, start=high, end=min(high / shrinks, 1.0))
 
 
 def fitted(
@@ -309,30 +319,3 @@ def pareto_shape(log_weight: Array) -> float:
     b_mean = float(normalized(log_likelihood) @ b)
     shape = float(np.log1p(-b_mean * x).mean())
     return (num * shape + 10 * 0.5) / (num + 10)
-
-
-def _largest_power(
-    log_rest: Array,
-    log_new: Array,
-    needed: float,
-    *,
-    shrinks: float = 0.8,
-    least: float = 1e-10,
-) -> float:
-    """Return the largest power of a likelihood that leaves enough draws effective.
-
-    Downward from 1: where most draws are near the posterior, a few of the prior
-    outweigh them at lower powers, and fewer are effective there. Each power that is
-    tried is so much less than the last, down to the least.
-    """
-    needed = min(needed, 0.5 * effective_sample_size(log_rest))
-
-    def suffices(power: float) -> bool:
-        return effective_sample_size(log_rest + power * log_new) >= needed
-
-    high = 1.0
-    while high > least and not suffices(high):
-        high *= shrinks
-    if high == 1 or high <= least:
-        return max(high, least)
-    return largest_power(suffices, start=high, end=min(high / shrinks, 1.0))

@@ -28,8 +28,6 @@ from sbi_active.inference.engine.potential import Density, Potential
 from sbi_active.inference.engine.search import Found
 from sbi_active.inference.engine.settings import Settings
 from sbi_active.inference.sampling.mixtures import (
-    Defended,
-    Proposal,
     StudentMixture,
     wider,
 )
@@ -42,7 +40,6 @@ def infer(
     rng: np.random.Generator,
     *,
     found: Found | None = None,
-    past: Pool | None = None,
     near: Array | None = None,
     settings: Settings = Settings(),  # noqa: B008  (frozen)
 ) -> Fit:
@@ -53,8 +50,6 @@ def infer(
             modes of it were found.
         rng: Source of the draws.
         found: Modes of the potential; None if a search got nowhere.
-        past: Draws for the first of these trials, with the likelihood of all, to which
-            are added.
         near: Draws of a guess, shape (n, d), looked at where the modes do not suffice.
         settings: Numbers of draws, and what decides between the ways.
     """
@@ -62,28 +57,24 @@ def infer(
     if found is not None:  # what was searched has residuals
         modes = _Modes(found, cast(Potential, potential), rng, settings)
     none = np.zeros(potential.dim, dtype=bool)
-    if modes is not None and past is None:
+    if modes is not None:
         free = modes.uninformed()
         if free.any() or share_cut(modes.potential, modes.found) > settings.hopeless:
             moved = modes.led_particles(free)
             if moved is not None:
                 return modes.fit_of(moved, free)
-    pool = Pool.empty(potential.dim, potential.num_trials) if past is None else past
-    if past is None:
-        _begin(pool, potential, rng, modes, near, settings)
-    elif modes is not None:
-        modes.go_on(pool)
+    pool = Pool.empty(potential.dim)
+    _begin(pool, potential, rng, modes, near, settings)
     num_modes = 0 if found is None else len(found.modes)
     sampling = ImportanceSampling(
         *(pool, potential, rng, max(settings.num_components, num_modes), settings),
         found=found,
-        is_first=past is None,
     )
     sampling.run()
     final, effective = pool.is_final, pool.effective_sample_size
     # Particles are led where normal draws would have to be more.
     wanted = settings.asked(1.0, (potential.dim + 3) / 4, is_cheap=False)
-    if modes is not None and past is None and effective < wanted:
+    if modes is not None and effective < wanted:
         moved = modes.led_particles(none)
         if moved is not None and moved.effective_sample_size > effective:
             return modes.fit_of(moved, none)
@@ -102,7 +93,9 @@ def infer(
         is_rough=sampling.is_rough,
         free=none,
         found=found,
-        pool=pool,
+        final=pool.final,
+        num_drawn=pool.num_final,
+        num_stages=len(pool.proposals),
     )
 
 
@@ -159,16 +152,6 @@ class _Modes:
     potential: Potential
     rng: np.random.Generator
     settings: Settings
-
-    def go_on(self, pool: Pool) -> None:
-        """Add draws of the modes that were found, and of what the pool says."""
-        own, first = self.settings, cast(Proposal, self.around())
-        weight = normalized(pool.log_mixture_weight)
-        few = 2 * self.potential.dim + 2
-        if len(pool.u) and 1 / float((weight**2).sum()) > few:
-            drawn = fitted(pool.u, weight, own.num_components, own, self.rng)
-            first = Defended(first, drawn, 0.5)
-        pool.add(first, first.sample(own.num_draws, self.rng), self.potential)
 
     def around(self) -> StudentMixture:
         r"""Return a mixture around the modes, as wide on each side as the density is.
@@ -323,25 +306,11 @@ class _Modes:
         return float(log_prior(u[:1] * 0)[0] - integral)
 
     def fit_of(self, moved: Bridged, free: NDArray[np.bool_]) -> Fit:
-        """Return the posterior that particles were led to.
-
-        The pool has them as draws of a mixture that is fitted to them: as many as there
-        are, with the weights that their evidence asks for.
-        """
-        own, n = self.settings, len(moved.u)
-        equal = np.full(n, 1 / n)
-        fit = fitted(moved.u, equal, own.num_components, own, self.rng)
-        proposals: list[tuple[int, Proposal]] = [(n, fit)]
-        log_prior = self.potential.log_prior(moved.u)
-        log_own = log_prior + moved.log_likelihood - moved.log_evidence
-        pool = Pool(
-            *(moved.u, log_prior, moved.log_likelihood, log_own + np.log(n), log_own),
-            *(np.ones(n, dtype=bool), n, proposals, self.potential.num_trials),
-            np.zeros(n),
-        )
+        """Return the posterior that particles were led to."""
+        n = len(moved.u)
         return Fit(
             u=moved.u,
-            weight=equal,
+            weight=np.full(n, 1 / n),
             log_likelihood=moved.log_likelihood,
             log_evidence=moved.log_evidence,
             standard_error=moved.standard_error,
@@ -350,5 +319,5 @@ class _Modes:
             free=free,
             found=self.found,
             particles=moved,
-            pool=pool,
+            num_drawn=n,
         )

@@ -152,14 +152,13 @@ def learned_fit(
     own = replace(CHEAP, num_effective=oversampling * num_effective)
     places = None if near is None else potential.coordinates.from_z(near)
     fit = infer(potential, rng, near=places, settings=own)
-    final = fit.pool.final
-    if final is None or not np.isfinite(fit.log_evidence):
+    if fit.final is None or not np.isfinite(fit.log_evidence):
         raise UnexplainedOutcomeError(NOTHING_EXPLAINS)
     effective = fit.effective_sample_size
     return LearnedFit(
         potential,
-        final,
-        efficiency=effective / max(fit.pool.num_final, 1),
+        fit.final,
+        efficiency=effective / max(fit.num_drawn, 1),
         effective_sample_size=effective,
         log_evidence=fit.log_evidence,
     )

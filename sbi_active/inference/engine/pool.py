@@ -9,9 +9,8 @@ from numpy.typing import NDArray
 from scipy.special import logsumexp
 
 from sbi_active.arrays import Array
-from sbi_active.inference.engine.potential import Density, SimulatedPotential
+from sbi_active.inference.engine.potential import Density
 from sbi_active.inference.engine.search import Found
-from sbi_active.inference.engine.settings import Settings
 from sbi_active.inference.sampling.mixtures import Proposal
 from sbi_active.inference.sampling.smc import Bridged
 from sbi_active.inference.sampling.weights import effective_sample_size, normalized
@@ -49,9 +48,6 @@ class Pool:
         is_final: Mask of those that the posterior rests on, shape (n,).
         num_final: Draws of their proposal, also those that do not count.
         proposals: Pairs of the number of draws and the proposal.
-        num_trials: Number of trials in the likelihood.
-        log_past: Log likelihood of the first trials, which is not tempered, shape (n,).
-        num_past: Number of these, for which there were draws before.
         final: Proposal of the final draws; None if it is not one.
     """
 
@@ -63,17 +59,13 @@ class Pool:
     is_final: NDArray[np.bool_]
     num_final: int = 0
     proposals: list[tuple[int, Proposal]] = field(default_factory=list)
-    num_trials: int = 0
-    log_past: Array = field(default_factory=lambda: np.zeros(0))
-    num_past: int = 0
     final: Proposal | None = None
 
     @staticmethod
-    def empty(dim: int, num_trials: int) -> Pool:
+    def empty(dim: int) -> Pool:
         """Return a pool without draws."""
         no, none = np.zeros((0, dim)), np.zeros(0)
-        flags = np.zeros(0, dtype=bool)
-        return Pool(no, none, none, none, none, flags, num_trials=num_trials)
+        return Pool(no, none, none, none, none, np.zeros(0, dtype=bool))
 
     @property
     def log_mixture_weight(self) -> Array:
@@ -187,41 +179,9 @@ class Pool:
         self.log_likelihood = np.concatenate([self.log_likelihood, log_likelihood])
         self.log_mixture = np.concatenate([self.log_mixture, log_mixture])
         self.log_own = np.concatenate([self.log_own, log_own])
-        log_past = np.zeros(len(u))
-        if self.num_past:
-            assert isinstance(potential, SimulatedPotential)  # as in with_trials
-            # Every trial of draws that count has been simulated; this only looks it up.
-            log_past = potential.log_likelihood(u, last=self.num_past)
-        self.log_past = np.concatenate([self.log_past, log_past])
         self.is_final = np.concatenate([self.is_final, np.full(len(u), is_final)])
         if is_final:
             self.num_final, self.final = self.num_final + len(drawn), proposal
-
-    def with_trials(self, potential: SimulatedPotential, settings: Settings) -> Pool:
-        """Return the draws that count with the likelihood of further trials.
-
-        Args:
-            potential: Potential of these trials and further ones.
-            settings: Settings that say how far below the best a draw is left out.
-        """
-        log_weight = self.log_mixture_weight
-        rows = np.flatnonzero(
-            log_weight > log_weight.max(initial=-np.inf) - settings.negligible
-        )
-        new = potential.log_likelihood(self.u[rows], first=self.num_trials)
-        rows, new = rows[np.isfinite(new)], new[np.isfinite(new)]
-        return Pool(
-            self.u[rows],
-            self.log_prior[rows],
-            self.log_likelihood[rows] + new,
-            self.log_mixture[rows],
-            self.log_own[rows],
-            np.zeros(len(rows), dtype=bool),
-            proposals=[*self.proposals],
-            num_trials=potential.num_trials,
-            log_past=self.log_likelihood[rows],
-            num_past=self.num_trials,
-        )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -260,7 +220,9 @@ class Fit(WeightedDraws):
         free: Parameters that keep their prior, shape (d,).
         found: Result of the search; None if it got nowhere.
         particles: Particles of sequential Monte Carlo; None of importance sampling.
-        pool: Draws to go on from after a further trial.
+        final: Proposal of the draws; None of particles.
+        num_drawn: Number of draws, also those that do not count.
+        num_stages: Number of proposals that were tried.
     """
 
     log_likelihood: Array
@@ -269,4 +231,6 @@ class Fit(WeightedDraws):
     free: NDArray[np.bool_]
     found: Found | None
     particles: Bridged | None = None
-    pool: Pool
+    final: Proposal | None = None
+    num_drawn: int
+    num_stages: int = 1

@@ -169,26 +169,17 @@ class SimulatedLikelihood:
             term[rows] = log_prob - seen.sum() * np.log(self.inflation)
         return term
 
-    def __call__(
-        self,
-        theta: Tensor,
-        *,
-        floor: float | Array = -np.inf,
-        first: int = 0,
-        last: int | None = None,
-    ) -> Array:
+    def __call__(self, theta: Tensor, *, floor: float | Array = -np.inf) -> Array:
         """Return log likelihoods, shape (n,), of parameters, shape (n, d).
 
         Args:
             theta: Float32.
             floor: A row is given up, as -inf, and the rest of its trials are not
                 simulated, once it can no longer reach this; one number, or one a row.
-            first: The first trial to count.
-            last: The one after the last to count; None counts all.
         """
         total = np.zeros(len(theta))
-        left = [*range(len(self))][first:last]
-        left.sort(key=lambda k: -self._cost[k])  # what decides comes first
+        # What decides comes first.
+        left = sorted(range(len(self)), key=lambda k: -self._cost[k])
         for place, k in enumerate(left):
             reachable = total + self.peak[left[place:]].sum() >= floor
             total[~reachable] = -np.inf
@@ -330,24 +321,14 @@ class SimulatedPotential:
         """Return the log density of u under the prior, shape (n,)."""
         return self.coordinates.log_prior(u)
 
-    def log_likelihood(
-        self,
-        u: Array,
-        *,
-        floor: float | Array = -np.inf,
-        first: int = 0,
-        last: int | None = None,
-    ) -> Array:
+    def log_likelihood(self, u: Array, *, floor: float | Array = -np.inf) -> Array:
         """Return log likelihoods, shape (n,), of places (n, d).
 
         Args:
             u: Places.
             floor: Value below which a place is given up, as -inf, or one a place.
-            first: Number of the first trial that counts.
-            last: Number after that of the last; None counts all.
         """
-        theta = self.coordinates.to_theta(u)
-        return self.likelihood(theta, floor=floor, first=first, last=last)
+        return self.likelihood(self.coordinates.to_theta(u), floor=floor)
 
     def residual(self, u: Array) -> tuple[Array]:
         """Return residuals of all trials in deviations of the noise, shape (n, N).

@@ -96,6 +96,8 @@ def search(
     rng: np.random.Generator,
     near: Array | None = None,
     settings: SearchSettings = SearchSettings(),  # noqa: B008  (frozen)
+    *,
+    screened: Array | None = None,
 ) -> Found | None:
     r"""Return normal approximations at the modes; None if no search gets anywhere.
 
@@ -112,6 +114,7 @@ def search(
         rng: Source of the draws.
         near: Places to begin at as well, shape (k, d).
         settings: Numbers of searches.
+        screened: Draws of the prior to look at first, shape (n, d); None draws them.
 
     References:
         Boender & Rinnooy Kan, Mathematical Programming 37 (1987).
@@ -123,7 +126,9 @@ def search(
         return np.clip(np.where(problem.searched, places, c.center), c.low, c.high)
 
     while True:
-        drawn = problem.sample_prior(own.num_screened * 2 ** len(looked), rng)
+        drawn = screened
+        if drawn is None or looked:
+            drawn = problem.sample_prior(own.num_screened * 2 ** len(looked), rng)
         looked.append(drawn)
         starts = start_at(drawn)
         if len(starts):

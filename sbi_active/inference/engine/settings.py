@@ -133,7 +133,6 @@ class Settings:
             twice change rows by a tenth or a third, and no evidence.
         reach: Deviations of the prior that they span.
         returning: Steps that bring them back to the ridge.
-        num_near: Draws at which a search begins after a further trial.
         surface: Settings of surfaces of the likelihood.
         search: Settings of the search.
     """
@@ -178,7 +177,6 @@ class Settings:
     idle: float = 0.1
     reach: float = 4.0
     returning: int = 5
-    num_near: int = 5
     surface: SurfaceSettings = field(default_factory=lambda: SurfaceSettings())
     search: SearchSettings = field(default_factory=SearchSettings)
 

@@ -205,9 +205,6 @@ class SurfacePotential:
             is_final=np.zeros(num, dtype=bool),
             num_final=0,
             proposals=[*pool.proposals],
-            num_trials=1,
-            log_past=np.zeros(num),
-            num_past=0,
             final=None,
         )
 

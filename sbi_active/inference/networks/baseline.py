@@ -8,8 +8,7 @@ from typing import Literal, NamedTuple
 import torch
 from torch import Tensor, nn
 
-from sbi_active.inference.networks.polynomials import held_out
-from sbi_active.inference.networks.response import Response
+from sbi_active.inference.networks.response import Response, held_out
 
 
 class Frames(NamedTuple):

@@ -10,8 +10,7 @@ from torch import Tensor, nn
 
 from sbi_active.arrays import finite
 from sbi_active.inference.networks.baseline import Baseline, Frames, local
-from sbi_active.inference.networks.polynomials import held_out
-from sbi_active.inference.networks.response import Response, log_normal
+from sbi_active.inference.networks.response import Response, held_out, log_normal
 
 
 def can_regress(

@@ -23,10 +23,13 @@ from torch.utils.data import DataLoader
 from typing_extensions import Self
 
 from sbi_active.expected import require
-from sbi_active.inference.networks.mixture_density import MixtureDensity, train_network
+from sbi_active.inference.networks.mixture_density import (
+    Adam,
+    MixtureDensity,
+    train_network,
+)
 from sbi_active.inference.rounds.condition import pack
 from sbi_active.inference.rounds.rows import check_proposal, require_whole
-from sbi_active.inference.sampling.adam import Adam
 from sbi_active.inference.trainers.base import ActiveInference
 from sbi_active.inference.trainers.signatures import extended, given_arguments
 from sbi_active.simulation.outcomes import Simulations

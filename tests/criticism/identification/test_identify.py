@@ -17,7 +17,7 @@ from sbi_active.criticism.linear.mixture import integrated
 from sbi_active.criticism.linear.model import LinearModel
 from sbi_active.criticism.linear.processes import Grams, Processes
 from sbi_active.criticism.results import ModelKey
-from sbi_active.inference.sampling.truncated import draws_between
+from sbi_active.inference.sampling.mixtures import draws_between
 from sbi_active.mujoco import randomization
 from tests.effects import autocorrelated, on_outcomes
 

@@ -17,7 +17,7 @@ from sbi_active import (
 from sbi_active.inference.emulation.emulator import emulated
 from sbi_active.inference.emulation.pool import TrialRows
 from sbi_active.inference.emulation.solving import whole_space
-from sbi_active.inference.emulation.weighing import largest_error
+from sbi_active.inference.emulation.stages import largest_error
 from sbi_active.inference.engine.learned import learned_fit
 from sbi_active.inference.sampling.coordinates import PriorCoordinates
 

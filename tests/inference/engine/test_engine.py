@@ -64,7 +64,7 @@ class Given(SimulatedPotential):
     def log_prior(self, u):
         return -0.5 * (u**2).sum(1) - 0.5 * self.dim * np.log(2 * np.pi)
 
-    def log_likelihood(self, u, *, floor=-np.inf, first=0, last=None):
+    def log_likelihood(self, u, *, floor=-np.inf):
         square = (self.residual(u)[0] ** 2).sum(1)
         return -0.5 * square - self.num_observed * np.log(self.sd * np.sqrt(2 * np.pi))
 
@@ -145,7 +145,7 @@ def test_where_nothing_fits_there_is_a_best_place():
 
 @pytest.mark.parametrize(("width", "missed"), [(0.1, 0.5), (1.5, 0.0)])
 def test_a_mode_that_draws_miss_is_told_by_those_of_other_proposals(width, missed):
-    rng, pool = np.random.default_rng(0), Pool.empty(1, 1)
+    rng, pool = np.random.default_rng(0), Pool.empty(1)
     given = Given(lambda u: 40 * (u**2 - 1), 1, 1)  # modes at -1 and 1
     for place, scale in ((1.0, width), (-1.0, 1.0)):
         drawn_from = StudentMixture(

@@ -54,7 +54,7 @@ def test_features_are_all_products():
 
 def test_a_polynomial_response_is_predicted_where_no_draw_was():
     own, rng = bent(), np.random.default_rng(0)
-    pool = Pool.empty(6, 1)
+    pool = Pool.empty(6)
     u = X + 0.5 * rng.standard_normal((500, 6))
     pool.add(PriorDraws(own), u, own)
     settings = SurfaceSettings(depth=np.inf)
@@ -68,7 +68,7 @@ def test_a_polynomial_response_is_predicted_where_no_draw_was():
 
 def test_few_draws_have_no_surface():
     own, rng = bent(), np.random.default_rng(0)
-    pool = Pool.empty(6, 1)
+    pool = Pool.empty(6)
     pool.add(PriorDraws(own), X + 0.1 * rng.standard_normal((10, 6)), own)
     assert fitted_surface(own, lambda r: r, pool, rng, SurfaceSettings()) is None
 
@@ -98,12 +98,12 @@ def test_weights_are_right_whatever_the_surface(shift):
 def test_most_draws_of_a_bent_posterior_count():
     own, rng = bent(0.1, 2.0), np.random.default_rng(1)
     found = infer(own, rng, found=search(own, rng))
-    assert isinstance(found.pool.final, Screened)
+    assert isinstance(found.final, Screened)
     exact = evidence_of_bent(0.1, 2.0)
-    assert 0 < found.pool.final.error < found.standard_error
+    assert 0 < found.final.error < found.standard_error
     error = 4 * found.standard_error + 0.01  # of the reference's own draws
     assert found.log_evidence == pytest.approx(exact, abs=error)
-    assert found.effective_sample_size > 0.5 * found.pool.num_final
+    assert found.effective_sample_size > 0.5 * found.num_drawn
     assert found.tail_shape < 0.7
 
 

@@ -9,11 +9,11 @@ from torch.distributions import MultivariateNormal
 from sbi_active.inference.networks.baseline import Baseline, local, upper_factor
 from sbi_active.inference.networks.conditioning import Conditioning, Whitening
 from sbi_active.inference.networks.mixture_density import (
+    Adam,
     MixtureDensity,
     train_network,
 )
 from sbi_active.inference.networks.response import Response
-from sbi_active.inference.sampling.adam import Adam
 from sbi_active.seeding import forked_generators
 from sbi_active.tasks.numerical import NumericalTask
 from tests import linear_gaussian

@@ -10,17 +10,18 @@ import torch
 from scipy.optimize import nnls
 from scipy.stats import multivariate_normal, multivariate_t, norm, truncnorm
 
-from sbi_active.inference.sampling.adam import Adam
-from sbi_active.inference.sampling.eigen import eigh
+from sbi_active.inference.networks.mixture_density import Adam
 from sbi_active.inference.sampling.gaussian_process import GaussianProcess
 from sbi_active.inference.sampling.least_squares import within
 from sbi_active.inference.sampling.mixtures import (
     StudentMixture,
+    eigh,
     fitted_normals,
+    log_inside,
     lower_factors,
+    truncated_normal,
 )
 from sbi_active.inference.sampling.smc import bridge
-from sbi_active.inference.sampling.truncated import log_inside, truncated_normal
 from sbi_active.inference.sampling.weights import systematic
 
 
