@@ -64,7 +64,7 @@ def test_an_error_is_told_and_what_is_within_is_not(caplog):
 
 def loop(**options):
     def slow(theta, action):
-        time.sleep(0.001)
+        time.sleep(0.01)
         return theta * action
 
     model = SimulatorModel(slow, noise=StudentTNoise(0.1, 9.0))  # of which samples tell
