@@ -24,7 +24,7 @@ EMPTY = re.compile(r"nan( (/|\+-) nan)*")
 TABLES = {
     "The paper's numerical model": (
         "numerical --summary",
-        "numerical --summary --seeds 0 60 --setting default --method asbi",
+        "numerical --summary --seeds 0 200 --setting default --method asbi",
         "numerical --summary --truth random --seeds 0 40 "
         "--setting default --method asbi",
         "numerical --summary --task sinh --setting default default_500 --method asbi",
