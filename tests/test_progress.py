@@ -64,7 +64,7 @@ def test_an_error_is_told_and_what_is_within_is_not(caplog):
 
 def loop(**options):
     def slow(theta, action):
-        time.sleep(0.01)
+        time.sleep(0.001)
         return theta * action
 
     model = SimulatorModel(slow, noise=StudentTNoise(0.1, 9.0))  # of which samples tell
@@ -74,8 +74,11 @@ def loop(**options):
     return close_loop(model, prior, trials, effects=[BIAS], **options)
 
 
-def test_the_closed_loop_tells_of_its_stages(caplog, capsys):
+def test_the_closed_loop_tells_of_its_stages(caplog, capsys, monkeypatch):
+    for name in ("long", "shown", "tick"):  # however quick a stage is
+        monkeypatch.setattr(News, name, 0.001)
     caplog.set_level(logging.INFO, "sbi_active")
+    loop()  # imports, which take longer than stages
     loop(show_progress=True)
     shown, said = capsys.readouterr().err, "\n".join(lines(caplog))
     for told in (shown, said):
