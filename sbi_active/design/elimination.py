@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import Any
 
 import torch
@@ -293,9 +292,7 @@ class GainEvaluator:
                 half.candidates(keep).join(new)
                 for half, new in zip(halves, _halves(drawn), strict=True)
             ]
-        given = self.model, halves[0], self.belief
-        compared = partial(self.estimator.compared, *given)
-        caution = self.estimator.cautions if self.num_others else compared
+        last = torch.stack([gains[0][a] for a in active])
         return choose(
             limits,
             action=action,
@@ -313,11 +310,18 @@ class GainEvaluator:
             stopped=stopped,
             notes=(
                 *said,
-                *caution(torch.stack([gains[0][a] for a in active])),
+                *self._cautions(halves[0], last),
                 *sampler.notes,
                 *notes,
             ),
         )
+
+    def _cautions(self, simulations: CandidateSimulations, gain: Tensor) -> list[str]:
+        """Return cautions about the contributions (a, n) of the last candidates."""
+        if self.num_others:
+            return self.estimator.cautions(gain)
+        with single_thread():
+            return self.estimator.compared(self.model, simulations, self.belief, gain)
 
 
 def _halves(simulations: CandidateSimulations) -> list[CandidateSimulations]:

@@ -227,6 +227,7 @@ class CandidateSampler:
         assert isinstance(self.simulator, SimulatorModel)
         again = self._simulate(self.simulator.mean, (theta[i], action[a]), "retry")
         self.num_drawn += len(again)
+        self.num_missing += again.counts["missing"]
         known = again.status != Outcome.MISSING
         measured = again.x.flatten(1).isfinite()
         if self.summaries is not None:

@@ -116,10 +116,8 @@ def choose_estimator(
     declared = simulations.mean is not None and simulations.noise is not None
     by_noise: dict[InformationGainEstimator, list[str]] = {}
     if declared or simulations.replicate is not None:
-        num_rows, linear = (
-            num_rows or len(simulations.theta),
-            LinearGain(max_bent=MAX_BENT),
-        )
+        linear = LinearGain(max_bent=MAX_BENT)
+        num_rows = num_rows or len(simulations.theta)
         many = declared and simulations.theta.shape[1] > MAX_NESTED_PARAMETERS
         if num_outcomes <= (1 if declared else MAX_NEIGHBOR_OUTCOMES):
             by_noise[EntropyGain()] = []
