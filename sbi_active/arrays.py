@@ -55,18 +55,21 @@ def own_tensor(
     return own
 
 
-def measured(value: Any, *, name: str = "x") -> Tensor:
-    """Return real numbers in float64 on the CPU, apart from any graph.
+def measured(
+    value: Any, dtype: torch.dtype = torch.float64, *, name: str = "x"
+) -> Tensor:
+    """Return real numbers on the CPU, apart from any graph.
 
     Args:
         value: Numbers, as :func:`own_tensor` takes them.
+        dtype: Type of the result.
         name: Name of the numbers, for errors.
 
     Raises:
         ValueError: If :func:`own_tensor` refuses the value.
     """
     with torch.inference_mode(False):  # tensors of that mode are barred from training
-        return own_tensor(value, torch.float64, name=name).detach().cpu()
+        return own_tensor(value, dtype, name=name).detach().cpu()
 
 
 def all_finite(x: Tensor) -> bool:

@@ -39,7 +39,7 @@ from sbi_active.campaign.options import CampaignDetails
 from sbi_active.seeding import forked_generators
 
 RESULT = Path(__file__).with_suffix(".json")
-NUMBERS, TRIALS, REPEATS = 100, 200, 30
+NUMBERS, TRIALS, REPEATS = 100, 200, 200
 PRIOR = BoxUniform(torch.zeros(2), torch.ones(2))
 ACTIONS = BoxActions([0.5], [2.0])
 OPTIONS = CampaignOptions(

@@ -291,7 +291,8 @@ def event_of(event: str, trial: Any = None, **entries: Any) -> dict[str, Any]:
         trial: The trial as it is afterwards.
         **entries: JSON data.
     """
-    told = {} if trial is None else {"trial": {**vars(Facts.of(trial))}}
+    facts = trial if trial is None or isinstance(trial, Facts) else Facts.of(trial)
+    told = {} if facts is None else {"trial": {**vars(facts)}}
     return {"time": now(), "event": event, **told, **entries}
 
 

@@ -17,7 +17,7 @@ from sbi_active.campaign.display.figures import plot_campaign
 from sbi_active.campaign.display.page import campaign_html, to_dataframe
 from sbi_active.campaign.health import assess, doubts, in_doubt
 from sbi_active.campaign.isolation import guarded
-from sbi_active.campaign.state import CampaignState, Trial, tensor_of
+from sbi_active.campaign.state import CampaignState, Trial
 from sbi_active.campaign.storage.directory import Storage
 from sbi_active.campaign.telling import Facts, Health, Telling, listed
 from sbi_active.display.figures import legible
@@ -256,9 +256,8 @@ class CampaignTrials(Telling[Trial]):
 
     def _executed(self, action: Any, asked: list[float]) -> list[float]:
         if action is None:
-            executed = tensor_of(asked)
-        else:
-            executed = _action_told(action, self.actions.action_dim)
+            return asked
+        executed = _action_told(action, self.actions.action_dim)
         if not bool(self.actions.contains(executed)):
             warn(
                 f"SA202 the executed action {executed.tolist()} is not in "
@@ -296,31 +295,33 @@ def outcome_told(x: Any, x_shape: torch.Size) -> Tensor:
             "expected the outcome x; got None; tell(x), or tell(status=...) with "
             "'invalid' or 'missing' where there is none"
         )
-    tensor = _numbers(x, "x")
-    if tensor.shape != x_shape and tensor.numel() == x_shape.numel() == 1:
-        tensor = tensor.reshape(x_shape)
-    rows = outcome_rows(tensor, x_shape)
-    if len(rows) != 1:
-        raise ValueError(
-            f"expected one outcome of shape {tuple(x_shape)}; got {len(rows)}; tell "
-            "one trial at a time"
-        )
-    infinite = np.isinf(rows[0].numpy())
+    row = _numbers(x, "x")
+    if row.shape != x_shape:
+        is_number = row.numel() == x_shape.numel() == 1
+        rows = outcome_rows(row.reshape(x_shape) if is_number else row, x_shape)
+        if len(rows) != 1:
+            raise ValueError(
+                f"expected one outcome of shape {tuple(x_shape)}; got {len(rows)}; "
+                "tell one trial at a time"
+            )
+        row = rows[0]
+    infinite = np.isinf(row.numpy())
     if infinite.any():
         warn(
             f"SA201 {infinite.sum()} of {infinite.size} told numbers are infinite and "
             "count as not measured; pass NaN where a sensor gave nothing"
         )
-        rows[0][infinite] = torch.nan
-    return rows[0]
+        row[infinite] = torch.nan
+    return row
 
 
 def _action_told(action: Any, action_dim: int) -> Tensor:
-    numbers = _numbers(action, "the action")
-    executed = action_rows(numbers, action_dim, num_rows=1)[0]
+    executed = _numbers(action, "the action")
+    if executed.shape != (action_dim,):
+        executed = action_rows(executed, action_dim, num_rows=1)[0]
     if not all_finite(executed):
         raise ValueError(
-            f"expected a finite action of real numbers; got {numbers.tolist()}; pass "
+            f"expected a finite action of real numbers; got {executed.tolist()}; pass "
             "the action that was executed, or status='missing' where it is unknown"
         )
     return executed
@@ -328,10 +329,10 @@ def _action_told(action: Any, action_dim: int) -> Tensor:
 
 def _numbers(told: Any, name: str) -> Tensor:
     """Return numbers apart from what the caller may still change."""
-    listed = isinstance(told, Sequence | np.ndarray)
-    if listed and None in np.array(told, dtype=object).ravel().tolist():
+    is_listed = not isinstance(told, Tensor) and isinstance(told, Sequence | np.ndarray)
+    if is_listed and None in np.array(told, dtype=object).ravel().tolist():
         raise ValueError(
             f"expected {name} of real numbers; got {told!r:.80}; pass NaN where a "
             "sensor gave nothing"
         )
-    return measured(told, name=name)
+    return measured(told, torch.float32, name=name)
