@@ -46,8 +46,7 @@ class DiscreteActions(ActionSpace):
         units: Sequence[str] | None = None,
     ) -> None:
         tensor = own_tensor(values, torch.float32, name="actions")
-        if tensor.ndim == 1:
-            tensor = tensor[:, None]
+        tensor = tensor[:, None] if tensor.ndim == 1 else tensor
         if tensor.ndim != 2 or tensor.numel() == 0:
             raise ValueError(
                 "expected actions of shape (a,) or (a, action_dim) with a >= 1; got "

@@ -113,15 +113,12 @@ class MixedActions(ActionSpace):
 
     def listed(self) -> Tensor | None:
         """Return all combinations, the last part varying fastest."""
-        rows = torch.empty(1, 0)
-        for part in self._parts:
-            value = part.listed()
-            if value is None:
-                return None
-            rows = torch.cat(
-                [rows.repeat_interleave(len(value), 0), value.repeat(len(rows), 1)], 1
-            )
-        return rows
+        values = [value for part in self._parts if (value := part.listed()) is not None]
+        if len(values) < len(self._parts):
+            return None
+        places = torch.cartesian_prod(*(torch.arange(len(value)) for value in values))
+        columns = places.reshape(-1, len(values)).unbind(1)
+        return torch.cat([v[k] for v, k in zip(values, columns, strict=True)], 1)
 
     @override
     def parts(self) -> list[ActionSpace]:

@@ -63,6 +63,12 @@ class ActionSpace(ABC):
         """Return all actions, shape (a, action_dim); None if there is no end."""
         return None
 
+    @property
+    def entry_labels(self) -> tuple[str, ...]:
+        """Names of the entries of the action with their units, as "speed [m/s]"."""
+        pairs = zip(self.names, self.units, strict=True)
+        return tuple(f"{name} [{unit}]" if unit else name for name, unit in pairs)
+
     def parts(self) -> list[ActionSpace]:
         """Return the spaces that this one is the product of."""
         return [self]

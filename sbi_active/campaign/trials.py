@@ -13,13 +13,13 @@ from torch.distributions import Distribution
 
 from sbi_active.actions import ActionSpace
 from sbi_active.arrays import all_finite, measured
-from sbi_active.campaign.display.figures import plot_campaign
-from sbi_active.campaign.display.page import campaign_html, to_dataframe
 from sbi_active.campaign.health import assess, doubts, in_doubt
 from sbi_active.campaign.isolation import guarded
 from sbi_active.campaign.state import CampaignState, Trial
 from sbi_active.campaign.storage.directory import Storage
 from sbi_active.campaign.telling import Facts, Health, Telling, listed
+from sbi_active.display.campaign_figure import plot_campaign
+from sbi_active.display.campaign_page import campaign_html, to_dataframe
 from sbi_active.display.figures import legible
 from sbi_active.inference.beliefs.belief import named, names_of, parameter_dim
 from sbi_active.inference.rounds.condition import action_rows, outcome_rows

@@ -18,7 +18,7 @@ from typing import Any
 from urllib.parse import quote, urlsplit
 
 from sbi_active.campaign.campaign import Campaign
-from sbi_active.campaign.display.page import page
+from sbi_active.display.campaign_page import page
 from sbi_active.display.page import templates
 from sbi_active.simulation.bank.store import LOCK, Store
 

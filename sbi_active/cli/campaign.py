@@ -228,7 +228,7 @@ def adopt(campaign: Any) -> cli.Answer:
 @on_campaign(cli.option("--out", "where to", cli.FILE, "PAGE.html"))
 def report(campaign: Any, out: Path | None) -> cli.Answer:
     """Write one page that shows the campaign."""
-    from sbi_active.campaign.display.page import page
+    from sbi_active.display.campaign_page import page
 
     path = out or Path(campaign.directory, "report.html")
     path.write_text(page(campaign), encoding="utf-8")

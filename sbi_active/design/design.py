@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
-from sbi_active.actions import ActionSpace
 from sbi_active.design.estimators.base import Bound
 from sbi_active.display.figures import legible
 from sbi_active.display.panels import plot_design
@@ -113,12 +112,6 @@ class Design:
         figure: Any = drawn.get_figure(root=True)
         legible(figure)
         return drawn
-
-
-def action_labels(actions: ActionSpace) -> tuple[str, ...]:
-    """Return the names of an action's entries with their units."""
-    pairs = zip(actions.names, actions.units, strict=True)
-    return tuple(f"{name} [{unit}]" if unit else name for name, unit in pairs)
 
 
 def equal_errors(error: Tensor) -> dict[str, Any]:

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 from torch.distributions import Distribution
 
-from sbi_active.design.design import Design, action_labels
+from sbi_active.design.design import Design
 from sbi_active.design.estimators.automatic import choose_estimator
 from sbi_active.design.estimators.base import (
     CandidateSimulations,
@@ -371,7 +371,7 @@ def choose(
             [runs * (len(a) + len(b)) for a, b in zip(*halves, strict=True)]
         ),
         cost=None if limits.price is None else price,
-        labels=action_labels(limits.actions),
+        labels=limits.actions.entry_labels,
         **known,
     )
 

@@ -10,7 +10,7 @@ from torch import Tensor
 from torch.distributions import Distribution
 
 from sbi_active.actions.discrete import Actions, action_space
-from sbi_active.design.design import Design, action_labels, equal_errors
+from sbi_active.design.design import Design, equal_errors
 from sbi_active.design.limits import DesignLimits
 from sbi_active.expected import Shown, suggests
 from sbi_active.seeding import derive_seed, forked_generators
@@ -72,7 +72,7 @@ class RandomDesigner(Shown):
             bound="none",
             index=chosen,
             num_simulations=0,
-            labels=action_labels(self.actions),
+            labels=self.actions.entry_labels,
             num_samples=torch.zeros(num).long(),
             notes=notes,
         )

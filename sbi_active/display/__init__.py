@@ -1,7 +1,7 @@
 """Display: tables, pages in one file, cards of a notebook, figures.
 
 This package sets text, Markdown and HTML. The texts themselves are with their subjects:
-in ``campaign.display``, ``criticism.report``, and with beliefs and designs.
+in ``criticism.report``, and with beliefs and designs.
 """
 
 from sbi_active.display.figures import legible, svg

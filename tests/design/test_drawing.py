@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from sbi_active import BoxActions
-from sbi_active.design.design import Design, action_labels
+from sbi_active.design.design import Design
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
@@ -33,7 +33,7 @@ def design(actions, num=30, index=4, candidates=None, **changes):
         "bound": "lower",
         "index": index,
         "num_simulations": 30,
-        "labels": action_labels(actions),
+        "labels": actions.entry_labels,
     }
     return Design(**(made | changes))
 

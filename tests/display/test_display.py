@@ -15,8 +15,8 @@ from sbi_active import (
     GaussianNoise,
     SimulatorModel,
 )
-from sbi_active.campaign.display.page import page as campaign_page
 from sbi_active.display import Page, Section, Table
+from sbi_active.display.campaign_page import page as campaign_page
 from sbi_active.display.figures import legible
 from sbi_active.display.notebook import badge, card, facts, items, table
 from tests.campaign.storage.campaigns import MODEL, OPTIONS, PRIOR, go_on, new, outcome

@@ -17,7 +17,7 @@ from sbi_active.campaign.learning.methods import find_method
 from sbi_active.campaign.learning.pooled import PooledLearner
 from sbi_active.campaign.learning.revision import compare
 from sbi_active.campaign.state import CampaignState, Trial
-from sbi_active.design.design import Design, action_labels, equal_errors
+from sbi_active.design.design import Design, equal_errors
 from sbi_active.design.designer import InformationGainDesigner
 from sbi_active.design.estimators.automatic import ESTIMATORS
 from sbi_active.design.limits import Cost, DesignLimits
@@ -357,7 +357,7 @@ def _model_design(criticism: Criticism, limits: DesignLimits) -> Design | None:
         bound="lower",
         index=index,
         num_simulations=criticism.rivals.simulator.num_simulations - spent,
-        labels=action_labels(limits.actions),
+        labels=limits.actions.entry_labels,
         estimator="ModelIndexGain",
         stopped="budget spent",
         notes=(f"about which is right: {', '.join(found.separates)}",),

@@ -24,7 +24,6 @@ from sbi_active.criticism.report.sections import (
 from sbi_active.criticism.report.words import cautions
 from sbi_active.criticism.results import NONE, Evaluation
 from sbi_active.criticism.steps.predictive import find_residuals
-from sbi_active.design.design import action_labels
 from sbi_active.display.figures import legible
 from sbi_active.display.notebook import card, items, table
 from sbi_active.plain import plain
@@ -191,7 +190,7 @@ def build_report(
         loop: The comparison, as in :func:`.cautions`.
         **parts: Parts of :class:`.Contents`.
     """
-    labels = trials.action_labels or (actions and action_labels(actions))
+    labels = trials.action_labels or (actions and actions.entry_labels)
     if labels is None:
         labels = tuple(f"action {i + 1}" for i in range(trials.action.shape[1]))
     channels = trials.channel_labels or parts["simulator"].channel_names

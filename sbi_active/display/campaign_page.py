@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sbi_active.design.design import action_labels
 from sbi_active.display.notebook import badge, card, table
 from sbi_active.display.page import Page, Picture, Section
 from sbi_active.display.table import Table
@@ -41,7 +40,7 @@ def to_dataframe(campaign: Any) -> DataFrame:
     shape = next((t.x.shape for t in state.trials if t.x is not None), ())
     numbers = outcome_labels(shape, campaign.channel_names)
     own = (*FIRST, *LAST)
-    labels = [_apart(n, "action", own) for n in action_labels(actions)]
+    labels = [_apart(n, "action", own) for n in actions.entry_labels]
     told = [_apart(n, "outcome", (*own, *labels)) for n in numbers or ["x"]]
     rows: list[dict[str, Any]] = []
     for trial in state.trials:

@@ -9,7 +9,6 @@ import torch
 from torch import Tensor
 
 from sbi_active.arrays import Array
-from sbi_active.design.design import action_labels
 from sbi_active.display.panels import plot_design
 from sbi_active.display.table import within
 from sbi_active.seeding import derive_seed, forked_generators
@@ -161,7 +160,7 @@ def _draw_belief(
 
 def _draw_actions(ax: Axes, campaign: Any) -> None:
     """Draw what each action was expected to tell, a line a trial, or the last map."""
-    trials, labels = campaign.state.trials, [*action_labels(campaign.actions)]
+    trials, labels = campaign.state.trials, [*campaign.actions.entry_labels]
     designed = [t for t in trials if np.isfinite(t.expected_gain[0])]
     if not designed:
         ax.set_title("actions, which were not designed", fontsize=10)
