@@ -255,22 +255,29 @@ def presence_information(simulations: CandidateSimulations) -> Tensor:
     simulator with declared noise, :math:`I(\theta; v) = H(v)`, from shares. Nothing is
     counted where replicates show v to be random, see :func:`problems_of_noise`.
     """
-    patterns, counted = _patterns(simulations), simulations.counted
+    present, counted = simulations.x.flatten(2).isfinite(), simulations.counted
     gain = torch.zeros(counted.shape, dtype=torch.float64)
     incomplete = (counted & (simulations.completeness < 1)).any(1)
     certain = ~random_presence(simulations)
     for a in torch.nonzero(incomplete & certain)[:, 0].tolist():
+        rows = counted[a]
         _, label, count = torch.unique(
-            patterns[a, 0, counted[a]], return_inverse=True, return_counts=True
+            present[a, rows], dim=0, return_inverse=True, return_counts=True
         )
-        gain[a, counted[a]] = -(count.double() / count.sum()).log()[label]
+        gain[a, rows] = -(count.double() / count.sum()).log()[label]
     return gain
 
 
 def random_presence(simulations: CandidateSimulations) -> Tensor:
-    """Return a mask of candidates whose outcomes differ in what is present, (a,)."""
-    first, second = _patterns(simulations).unbind(1)
-    return ((first != second) & simulations.counted).any(1)
+    """Return a mask of candidates whose outcomes differ in what is present, (a,).
+
+    They differ from their replicates, or from what is without noise.
+    """
+    again = simulations.replicate
+    again = simulations.mean if again is None else again
+    assert again is not None
+    differs = simulations.x.isfinite() != again.isfinite()
+    return (differs.flatten(2).any(2) & simulations.counted).any(1)
 
 
 def problems_of_noise(
@@ -327,17 +334,3 @@ def presence_notes(simulations: CandidateSimulations) -> list[str]:
         f"up to {float(partly.double().mean(1).max()):.0%} of an action's outcomes "
         "are partly observed: their numbers are not used, only which are present"
     ]
-
-
-def _patterns(simulations: CandidateSimulations) -> Tensor:
-    """Number the patterns of NaN of each outcome and its twin, shape (a, 2, n)."""
-    again = simulations.replicate
-    again = simulations.mean if again is None else again
-    assert again is not None
-    present = torch.stack(
-        [part.flatten(2).isfinite() for part in (simulations.x, again)], 1
-    )
-    if bool(present.all()):
-        return torch.zeros(present.shape[:3]).long()
-    flat = present.flatten(0, 2)
-    return torch.unique(flat, dim=0, return_inverse=True)[1].reshape(present.shape[:3])
