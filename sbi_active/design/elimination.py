@@ -27,7 +27,6 @@ from sbi_active.seeding import derive_seed
 from sbi_active.threads import single_thread
 
 
-@dataclass(frozen=True)
 class Race:
     r"""The leading candidate and its probability, under the central limit.
 
@@ -35,6 +34,15 @@ class Race:
     contributions over n. It is applied through the contributions themselves,
     :math:`\sum_i w_i (g_i - \bar g) / n` with standard normal weights, which needs no
     factor of an almost singular matrix and lets candidates differ in n.
+
+    Args:
+        contributions: Contributions of the candidates to their estimates, shape (a, n),
+            NaN where a row is missing. Rows are common.
+        seed: Seed of the draws behind probabilities.
+        num_draws: Number of these draws; with a thousand the standard error of a
+            probability is at most .016.
+        reach: Standard errors within which a candidate stays; with half as many the
+            best of several is dropped now and then.
 
     Attributes:
         leader: Index of the largest mean.
@@ -44,51 +52,26 @@ class Race:
             bool.
     """
 
-    leader: int
-    probability_best: Tensor
-    regret: float
-    in_reach: Tensor
-
-    @staticmethod
-    def run(
-        contributions: list[Tensor],
+    def __init__(
+        self,
+        contributions: Tensor,
         seed: int,
         *,
         num_draws: int = 1_000,
         reach: float = 3.0,
-    ) -> Race:
-        """Compare candidates by contributions (n,) each, NaN where a row is missing.
-
-        Their first rows are common.
-
-        Args:
-            contributions: Contributions of each candidate.
-            seed: Seed of the draws behind probabilities.
-            num_draws: Number of these draws; with a thousand the standard error of a
-                probability is at most .016.
-            reach: Standard errors within which a candidate stays; with half as many
-                the best of several is dropped now and then.
-        """
-        longest = max(map(len, contributions))
+    ) -> None:
         generator = torch.Generator().manual_seed(derive_seed(seed, "best"))
-        weights = torch.randn(
-            longest, num_draws, generator=generator, dtype=torch.float64
-        )
-        mean = torch.stack([row.nanmean() for row in contributions])
-        draws = torch.stack(
-            [
-                m
-                + (row - m).nan_to_num(0.0)
-                @ weights[: len(row)]
-                / int(row.isfinite().sum())
-                for m, row in zip(mean, contributions, strict=True)
-            ]
-        )
-        best = torch.bincount(draws.argmax(0), minlength=len(contributions))
-        leader = int(mean.argmax())
-        regret = float((draws.amax(0) - draws[leader]).mean())
-        in_reach = mean + reach * paired_errors(contributions, leader) >= mean[leader]
-        return Race(leader, best.double() / num_draws, regret, in_reach)
+        size = contributions.shape[1], num_draws
+        weights = torch.randn(size, generator=generator, dtype=torch.float64)
+        mean, num = contributions.nanmean(1), contributions.isfinite().sum(1)
+        off = (contributions - mean[:, None]).nan_to_num(0.0)
+        draws = mean[:, None] + off @ weights / num[:, None]
+        best = torch.bincount(draws.argmax(0), minlength=len(mean))
+        self.probability_best = best.double() / num_draws
+        self.leader = int(mean.argmax())
+        self.regret = float((draws.amax(0) - draws[self.leader]).mean())
+        error = standard_error(contributions - contributions[self.leader])
+        self.in_reach = mean + reach * error >= mean[self.leader]
 
     def reason(self, negligible: float, *, sure: float = 0.95) -> str | None:
         """Return why no further simulations are needed; None if they are.
@@ -100,14 +83,6 @@ class Race:
         if float(self.probability_best[self.leader]) > sure:
             return "leader separated"
         return "difference negligible" if self.regret < negligible else None
-
-
-def paired_errors(contributions: Sequence[Tensor], chosen: int) -> Tensor:
-    """Return standard errors of the differences to one candidate, on shared rows."""
-    other = contributions[chosen]
-    return torch.stack(
-        [standard_error(row[: len(other)] - other[: len(row)]) for row in contributions]
-    )
 
 
 @dataclass
@@ -204,10 +179,8 @@ class GainEvaluator:
             drawn = self.draw(num, action)
             gain, cost = self(drawn), self.limits.cost(action)
             valid, counted = drawn.num_valid()
-            error = torch.stack([standard_error(row) for row in gain])
-            return Evaluations(
-                action, gain.nanmean(1) / cost, error / cost, valid / counted.double()
-            )
+            error, valid = standard_error(gain) / cost, valid / counted.double()
+            return Evaluations(action, gain.nanmean(1) / cost, error, valid)
 
         return Objective(
             actions=self.limits.actions,
@@ -261,25 +234,30 @@ class GainEvaluator:
         eligible = limits.reached_by(num_valid / num_counted)
         said += limits.excluded_note(eligible)
         cost = limits.cost(action)
-        weight = cost.mean() / cost
-        gains = [[torch.empty(0)] * num_actions for _ in range(2)]
+        weight = (cost.mean() / cost)[:, None]
+        runs, spent = len(first.outcomes()), torch.zeros(num_actions).long()
+        gains = torch.empty(2, num_actions, 0).double()
 
-        def estimate(index: Tensor, halves: list[CandidateSimulations]) -> None:
-            for half, gain in zip(halves, gains, strict=True):
-                for a, row in zip(index.tolist(), self(half), strict=True):
-                    gain[a] = row
+        def estimate(index: Tensor, halves: list[CandidateSimulations]) -> Tensor:
+            """Return all gains with those of some candidates, NaN where none is."""
+            found = torch.stack([self(half) for half in halves])
+            num = found.shape[2]
+            spent[index] = 2 * num * runs
+            padding = 0, num - gains.shape[2]
+            every = torch.nn.functional.pad(gains, padding, value=torch.nan)
+            every[:, index] = found
+            return every
 
         active, excluded = (torch.nonzero(e)[:, 0] for e in (eligible, ~eligible))
         if len(excluded):  # estimated once, never chosen
-            estimate(excluded, [half.candidates(excluded) for half in halves])
+            gains = estimate(excluded, [half.candidates(excluded) for half in halves])
             halves = [half.candidates(active) for half in halves]
-        runs = len(first.outcomes())
         while True:
-            estimate(active, halves)
-            race = Race.run([weight[a] * gains[0][a] for a in active], self.seed)
+            gains = estimate(active, halves)
+            race = Race(weight[active] * gains[0, active], self.seed)
             keep = race.in_reach
-            spent = 2 * len(halves[0].theta) * runs
-            more = affordable(min(spent, most * num_samples - spent), int(keep.sum()))
+            own = int(spent[active[0]])
+            more = affordable(min(own, most * num_samples - own), int(keep.sum()))
             stopped = race.reason(negligible) or ("budget spent" if more < 8 else None)
             if stopped is not None:
                 break
@@ -292,7 +270,6 @@ class GainEvaluator:
                 half.candidates(keep).join(new)
                 for half, new in zip(halves, _halves(drawn), strict=True)
             ]
-        last = torch.stack([gains[0][a] for a in active])
         return choose(
             limits,
             action=action,
@@ -301,7 +278,7 @@ class GainEvaluator:
             leader=int(active[race.leader]),
             seed=self.seed,
             probability_valid=num_valid / num_counted.double(),
-            runs=runs,
+            num_samples=spent,
             estimator=type(self.estimator).__name__,
             # A difference of two bounds is none.
             bound="none" if self.num_others else self.estimator.bound_on(self.model),
@@ -310,7 +287,7 @@ class GainEvaluator:
             stopped=stopped,
             notes=(
                 *said,
-                *self._cautions(halves[0], last),
+                *self._cautions(halves[0], gains[0, active]),
                 *sampler.notes,
                 *notes,
             ),
@@ -333,11 +310,10 @@ def choose(
     limits: DesignLimits,
     *,
     action: Tensor,
-    halves: Sequence[Sequence[Tensor]],
+    halves: Tensor,
     eligible: Tensor,
     leader: int,
     seed: int,
-    runs: int = 1,
     **known: Any,
 ) -> Design:
     """Return the design of the leading candidate.
@@ -346,30 +322,24 @@ def choose(
         limits: Limits and costs of the actions.
         action: Candidates, shape (a, action_dim).
         halves: Contributions of the simulations that chose, and of those that report,
-            one tensor (n,) a candidate.
+            shape (2, a, n), NaN where there are none.
         eligible: Mask of the candidates that may be chosen, shape (a,), bool.
         leader: The candidate of the largest utility.
         seed: Seed of the draws behind probabilities.
-        runs: Simulations of each contribution.
         **known: Fields of the :class:`.Design` that are known already.
     """
     price, report = limits.cost(action), halves[1]
-    both = zip(*halves, eligible, price, strict=True)
+    utility = torch.cat([*halves], 1)[eligible] / price[eligible, None]
     probability_best = torch.zeros(len(price), dtype=torch.float64)
-    probability_best[eligible] = Race.run(
-        [torch.cat([a, b]) / c for a, b, e, c in both if e], seed
-    ).probability_best
+    probability_best[eligible] = Race(utility, seed).probability_best
     return Design(
         action=action[leader],
         candidates=action,
-        expected_information_gain=torch.stack([row.nanmean() for row in report]),
-        standard_error=torch.stack([standard_error(row) for row in report]),
-        difference_standard_error=paired_errors(report, leader),
+        expected_information_gain=report.nanmean(1),
+        standard_error=standard_error(report),
+        difference_standard_error=standard_error(report - report[leader]),
         probability_best=probability_best,
         index=leader,
-        num_samples=torch.tensor(
-            [runs * (len(a) + len(b)) for a, b in zip(*halves, strict=True)]
-        ),
         cost=None if limits.price is None else price,
         labels=limits.actions.entry_labels,
         **known,

@@ -64,39 +64,38 @@ def design_given(
             "leave out simulations="
         )
     near = torch.isclose(given.action[:, None], action, rtol=1e-5, atol=1e-7).all(2)
-    lost = given.status == Outcome.MISSING
     num = near.sum(0)
     if int(num.max()) < fewest:
         raise ValueError(
             f"expected simulations with at least {fewest} rows of a candidate; got "
             "fewer of every one; pass rows at the actions of the list"
         )
-    counted = (near & ~lost[:, None]).sum(0)
-    share = (near & (given.status == Outcome.OK)[:, None]).sum(0) / counted.double()
-    share[num < fewest] = torch.nan
-    unknown, cost = torch.full((2,), torch.nan), limits.cost(action)
-    halves = [[unknown] * len(action) for _ in range(2)]
+    share = torch.full((len(action),), torch.nan).double()
+    gains = torch.full((2, len(action), -(-int(num.max()) // 2)), torch.nan).double()
     for a in torch.nonzero(num >= fewest)[:, 0].tolist():
-        for k, half in enumerate(halves):
-            rows = torch.nonzero(near[:, a])[k::2, 0]
-            outcomes = CandidateSimulations(
-                *(given.theta[rows], action[a : a + 1], given.x[rows][None]),
-                missing=lost[rows][None],
-            )
+        rows = torch.nonzero(near[:, a])[:, 0]
+        outcomes = CandidateSimulations(
+            *(given.theta[rows], action[a : a + 1], given.x[rows][None]),
+            missing=(given.status[rows] == Outcome.MISSING)[None],
+        )
+        valid, counted = outcomes.num_valid()
+        share[a] = valid / counted
+        for k in range(2):
+            half = outcomes.samples(slice(k, None, 2))
             if estimator is None:
-                estimator = choose_estimator(model, outcomes, belief)[0]
+                estimator = choose_estimator(model, half, belief)[0]
             with single_thread():
-                half[a] = estimator(model, outcomes, belief)[0]
+                gains[k, a, : len(half.theta)] = estimator(model, half, belief)[0]
     eligible = (num >= fewest) & limits.reached_by(share)
     index = torch.nonzero(eligible)[:, 0]
-    race = Race.run([halves[0][a] / cost[a] for a in index], seed)
+    race = Race(gains[0, index] / limits.cost(action)[index, None], seed)
     said = [IN_SAMPLE, *limits.excluded_note(eligible | (num < fewest))]
     if few := int((num < fewest).sum()):
         said.append(f"{few} candidates with fewer than {fewest} rows excluded")
     return choose(
         limits,
         action=action,
-        halves=halves,
+        halves=gains,
         eligible=eligible,
         leader=int(index[race.leader]),
         seed=seed,
@@ -104,6 +103,7 @@ def design_given(
         estimator=type(estimator).__name__,
         bound="none",  # the model may have seen the rows
         num_simulations=0,
+        num_samples=num * (num >= fewest),
         stopped="simulations given",
         notes=(*said, *notes),
     )

@@ -24,7 +24,7 @@ BY_LUCK = {
 
 def estimate(world, estimator, simulations):
     gain = estimator(world, simulations, PRIOR)
-    return gain.nanmean(1), torch.stack([standard_error(row) for row in gain])
+    return gain.nanmean(1), standard_error(gain)
 
 
 def lose_rows(simulations, share, seed=0):
@@ -73,7 +73,7 @@ def test_a_network_that_knows_validity_chooses_as_the_exact_posterior():
     inference.append_simulations(theta, x, action=action, belief=PRIOR).train()
     rows = replace(world.simulations(2_000, 1), replicate=None)
     gain = PosteriorGain()(inference.build_posterior(), rows, PRIOR)
-    mean, error = gain.mean(1), torch.stack([standard_error(row) for row in gain])
+    mean, error = gain.mean(1), standard_error(gain)
     assert int(mean.argmax()) == int(world.exact()["counted"].argmax()) == 2
     assert (mean < world.exact()["counted"] + 3 * error).all()  # a lower bound,
     assert mean[2] > world.exact()["validity"][2] + 3 * error[2]  # not trivial

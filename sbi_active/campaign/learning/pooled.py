@@ -193,12 +193,11 @@ class PooledLearner(Learner):
         shares = torch.from_numpy(valid)[which]
         eligible = limits.reached_by(shares)
         utility = (rows.mean(1) / limits.cost(listed)).masked_fill(~eligible, -math.inf)
-        middle = rows.shape[1] // 2
         num, missing = self._spent(before)
         return choose(
             limits,
             action=listed,
-            halves=([*rows[:, :middle]], [*rows[:, middle:]]),
+            halves=rows.unflatten(1, (2, -1)).transpose(0, 1),
             eligible=eligible,
             leader=int(utility.argmax()),
             seed=seed,
@@ -207,6 +206,7 @@ class PooledLearner(Learner):
             bound="none",
             num_simulations=num,
             num_missing=missing,
+            num_samples=torch.full_like(which, rows.shape[1]),
             stopped="budget spent",
             notes=(*notes, *limits.excluded_note(eligible)),
         )

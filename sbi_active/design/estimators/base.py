@@ -221,9 +221,11 @@ def noise_scale(simulations: CandidateSimulations) -> Tensor:
 
 
 def standard_error(contributions: Tensor) -> Tensor:
-    """Return the standard error of a mean of contributions (n,), NaN where missing."""
-    known = contributions[contributions.isfinite()]
-    return known.std() / len(known) ** 0.5
+    """Return standard errors of means over the last axis, of NaN where missing."""
+    known = contributions.where(contributions.isfinite(), torch.nan)
+    square = (known - known.nanmean(-1, keepdim=True)).square().nansum(-1)
+    num = known.isfinite().sum(-1)
+    return (square / (num - 1) / num).sqrt()
 
 
 def at_least(value: int, least: int, name: str, usual: int) -> int:

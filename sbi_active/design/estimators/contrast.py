@@ -176,7 +176,7 @@ class RatioGain(_Critic):
         """
         other = InfoNCEGain()
         bound = other(model, simulations, belief)
-        error = torch.stack([standard_error(row) for row in bound - gain])
+        error = standard_error(bound - gain)
         apart = (bound - gain).nanmean(1).abs() - negligible - 4 * error
         worst = int(apart.nan_to_num(nan=-torch.inf).argmax())
         if not bool(apart[worst] > 0) or other.cautions(bound):

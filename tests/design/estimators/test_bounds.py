@@ -36,7 +36,7 @@ def rows(actions=ACTIONS, n=512, seed=0):
 
 def estimate(estimator, model, simulations, belief=PRIOR):
     gain = estimator(model, simulations, belief)
-    return gain.mean(1), torch.stack([standard_error(row) for row in gain])
+    return gain.mean(1), standard_error(gain)
 
 
 @pytest.mark.parametrize("name", ESTIMATORS)
