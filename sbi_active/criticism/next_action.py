@@ -172,34 +172,23 @@ class PredictedRival:
         self._trials = following(rivals, candidates)
         self._draws: tuple[tuple[int, int], Tensor] | None = None
 
-    def predict(self, action: Tensor, num_samples: int, seed: int) -> Tensor:
+    def predict(
+        self, action: Tensor, num_samples: int, seed: int
+    ) -> tuple[Tensor, Tensor, Tensor]:
         """Return draws from the posterior predictive, shape (n, q).
+
+        Beside them are the draws without noise, and its standard deviations.
 
         Args:
             action: One of the candidates, shape (action_dim,).
             num_samples: Number of draws n.
             seed: Seed of the draws.
         """
-        return self._at(action, num_samples, seed)[0]
-
-    def predict_mean(
-        self, action: Tensor, num_samples: int, seed: int
-    ) -> tuple[Tensor, Tensor]:
-        """Return these draws without noise, and its standard deviations, (n, q).
-
-        Args:
-            action: One of the candidates, as in :meth:`predict`.
-            num_samples: Number of draws n, as in :meth:`predict`.
-            seed: Seed of the draws, as in :meth:`predict`.
-        """
-        _, mean, sd = self._at(action, num_samples, seed)
-        return mean, sd
-
-    def _at(self, action: Tensor, num_samples: int, seed: int) -> Tensor:
         if self._draws is None or self._draws[0] != (num_samples, seed):
             self._draws = (num_samples, seed), self._predict(num_samples, seed)
         same = (self.candidates == action.to(self.candidates)).all(-1)
-        return self._draws[1][:, :, int(same.int().argmax())]
+        x, mean, sd = self._draws[1][:, :, int(same.int().argmax())]
+        return x, mean, sd
 
     def _predict(self, num_samples: int, seed: int) -> Tensor:
         """Return outcomes, means and deviations, shape (3, n, a, q).

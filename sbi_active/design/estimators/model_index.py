@@ -26,23 +26,23 @@ from sbi_active.seeding import derive_seed
 
 
 class RivalPredictive(Protocol):
-    """A rival model: how probable it is, and what it predicts.
-
-    One that knows what its noise adds to a draw has ``predict_mean(action, num_samples,
-    seed)`` as well, which returns the outcomes without noise behind the draws of
-    ``predict`` and the standard deviations of the noise in them, both of the shape of
-    the draws. A posterior draw that is used again has the same outcome without noise.
-    The predictive density is then a mixture of the noise's, sharper than any density
-    fitted to the outcomes alone.
-    """
+    """A rival model: how probable it is, and what it predicts."""
 
     @property
     def probability(self) -> float:
         """Posterior probability, those of all rivals adding up to one."""
         ...
 
-    def predict(self, action: Tensor, num_samples: int, seed: int) -> Tensor:
+    def predict(
+        self, action: Tensor, num_samples: int, seed: int
+    ) -> Tensor | tuple[Tensor, Tensor, Tensor]:
         """Draw from the posterior predictive, parameters and noise included.
+
+        A model that knows what its noise adds to a draw returns the outcomes without
+        noise behind the draws, and the standard deviations of the noise in them, as
+        well. A posterior draw that is used again has the same outcome without noise.
+        The predictive density is then a mixture of the noise's, sharper than any
+        density fitted to the outcomes alone; all rivals have to know theirs.
 
         Args:
             action: One action, shape (action_dim,).
@@ -50,7 +50,8 @@ class RivalPredictive(Protocol):
             seed: Seed of the draws; the same for all actions and models.
 
         Returns:
-            Shape (n, *x_shape), NaN where there is no measurement.
+            Shape (n, *x_shape), NaN where there is no measurement; each of the three,
+            if there are these.
         """
         ...
 
@@ -95,7 +96,6 @@ class RivalSampler:
         self.rivals = [r for r, p in zip(rivals, values, strict=True) if p > 0]
         self.probability = probability[probability > 0] / total
         self.seed, self.num_drawn, self._num_waves = seed, 0, 0
-        self._is_noisy = all(hasattr(r, "predict_mean") for r in self.rivals)
 
     def draw(self, num_samples: int, action: Tensor) -> CandidateSimulations:
         """Draw outcomes.
@@ -122,9 +122,12 @@ class RivalSampler:
                     f"means and deviations; got {shapes}; return one row a draw, and "
                     "predict the same x"
                 )
-            each_kind = zip(*drawn, strict=True)
+            each_kind = zip(*drawn, strict=False)  # those that all rivals have
             rows.append(torch.stack([torch.stack(kind, 1) for kind in each_kind]))
         every = torch.stack(rows, 1).flatten(2, 3)
+        # kernels as narrow as the noise need what a float loses of a large number
+        if len(every) == 1 or every[0, 0, 0].numel() > MOST_NUMBERS:
+            every = every.float()
         self.num_drawn += len(action) * every.shape[2]
         index = torch.arange(num_rivals).repeat(each)[:, None]
         x, *noise = every if every.ndim > 3 else every[..., None]
@@ -136,15 +139,10 @@ class RivalSampler:
         self._num_waves = 0
 
     def _predict(self, k: int, action: Tensor, num: int, seed: int) -> list[Tensor]:
-        """Return outcomes, and where all rivals know them means and deviations."""
-        rival: Any = self.rivals[k]
-        given = action, num, derive_seed(seed, k)
-        noise = rival.predict_mean(*given) if self._is_noisy else ()
-        parts = [torch.as_tensor(part) for part in (rival.predict(*given), *noise)]
-        # kernels as narrow as the noise need what a float loses of a large number
-        exact = self._is_noisy and parts[0][0].numel() <= MOST_NUMBERS
-        dtype = torch.float64 if exact else torch.float32
-        return [part.to(dtype) for part in parts]
+        """Return outcomes, and where the rival knows them means and deviations."""
+        found = self.rivals[k].predict(action, num, derive_seed(seed, k))
+        parts = found if isinstance(found, tuple) else (found,)
+        return [torch.as_tensor(part).double() for part in parts]
 
 
 class ModelIndexGain(InformationGainEstimator):

@@ -55,10 +55,10 @@ def test_rivals_predict_their_posterior_predictive():
     c = criticism(action.tolist(), 0.7 * action, [BIAS], FORWARD)
     c.trace()
     rival = PredictedRival(c.rivals, ModelKey(), 0.5, FORWARD.values)
-    x = rival.predict(torch.tensor([2.5]), 4_000, 3)
+    x, *_ = rival.predict(torch.tensor([2.5]), 4_000, 3)
     assert x.shape == (4_000, 1)
-    assert torch.equal(x, rival.predict(torch.tensor([2.5]), 4_000, 3))
-    assert not torch.equal(x, rival.predict(torch.tensor([2.5]), 4_000, 4))
+    assert torch.equal(x, rival.predict(torch.tensor([2.5]), 4_000, 3)[0])
+    assert not torch.equal(x, rival.predict(torch.tensor([2.5]), 4_000, 4)[0])
     # Least squares in one parameter; errors of the mean and of the deviation.
     fit = c.rivals.trials
     square = float((fit.action**2).sum())

@@ -121,17 +121,15 @@ class Mixed:
     spread: float
     noise: float = 1.0
 
-    def predict_mean(self, action, num_samples, seed):
+    def predict(self, action, num_samples, seed):
         generator = torch.Generator().manual_seed(seed)
         mean = self.center + self.spread * torch.randn(60, generator=generator)
         mean = mean[torch.randint(60, (num_samples,), generator=generator)]
         mean = (mean * action)[:, None]
-        return mean, torch.full_like(mean, self.noise)
-
-    def predict(self, action, num_samples, seed):
-        mean, sd = self.predict_mean(action, num_samples, seed)
+        sd = torch.full_like(mean, self.noise)
         generator = torch.Generator().manual_seed(seed + 1)
-        return mean + sd * torch.randn(num_samples, 1, generator=generator)
+        x = mean + sd * torch.randn(num_samples, 1, generator=generator)
+        return x, mean, sd
 
 
 def test_draws_that_stand_for_the_same_parameters_tell_nothing_by_it():
