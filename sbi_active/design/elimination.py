@@ -270,6 +270,9 @@ class GainEvaluator:
                 half.candidates(keep).join(new)
                 for half, new in zip(halves, _halves(drawn), strict=True)
             ]
+        with single_thread():
+            known = self.model, halves[0], self.belief, gains[0, active]
+            said += self.estimator.compared(*known)
         return choose(
             limits,
             action=action,
@@ -285,20 +288,8 @@ class GainEvaluator:
             num_simulations=sampler.num_drawn,
             num_missing=sampler.num_missing,
             stopped=stopped,
-            notes=(
-                *said,
-                *self._cautions(halves[0], gains[0, active]),
-                *sampler.notes,
-                *notes,
-            ),
+            notes=(*said, *sampler.notes, *notes),
         )
-
-    def _cautions(self, simulations: CandidateSimulations, gain: Tensor) -> list[str]:
-        """Return cautions about the contributions (a, n) of the last candidates."""
-        if self.num_others:
-            return self.estimator.cautions(gain)
-        with single_thread():
-            return self.estimator.compared(self.model, simulations, self.belief, gain)
 
 
 def _halves(simulations: CandidateSimulations) -> list[CandidateSimulations]:

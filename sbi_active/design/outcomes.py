@@ -69,15 +69,9 @@ def conditional_gain(
     :class:`JointLikelihood`, or None.
     """
     action_dim = simulations.action.shape[1] // (1 + num_others)
-    others = replace(
-        simulations,
-        action=simulations.action[:1, action_dim:],
-        **{
-            name: part[:1, :, 1:] if name != "missing" else part[:1]
-            for name in ("x", "mean", "replicate", "missing")
-            if (part := getattr(simulations, name)) is not None
-        },
-    )
+    one = simulations.candidates(torch.tensor([0]))
+    parts = {k: v[:, :, 1:] for k, v in one.parts().items() if k != "missing"}
+    others = replace(one, action=one.action[:, action_dim:], **parts)
     known = estimator(model, others, belief)
     return estimator(model, simulations, belief) - known
 

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from functools import partial
 from itertools import product
 from typing import Any
 
@@ -120,8 +121,9 @@ class CandidateSampler:
         change = mean.unflatten(1, (len(rows), d)) - drawn.mean[:, rows, None]
         white = change.flatten(3).double() / noise_scale(drawn)[:, None, None]
         slope = white / steps.diagonal(dim1=1, dim2=2)[..., None]
-        fisher = torch.full((num_actions, n, d, d), torch.nan).double()
-        fisher[:, rows] = slope @ slope.mT
+        own = slope.unflatten(3, (1 + len(self.others), -1)).transpose(2, 3)
+        fisher = torch.full((num_actions, n, own.shape[2], d, d), torch.nan).double()
+        fisher[:, rows] = own @ own.mT
         return replace(drawn, fisher=fisher)
 
     @property
@@ -249,7 +251,7 @@ class CandidateSampler:
         model = self.simulator
         if not isinstance(model, SimulatorModel) or model.noise is None:
             return False
-        reproducible = run(_Reproducible(model), "reproducible")
+        reproducible = run(partial(_reproducible, model), "reproducible")
         return bool((reproducible[reproducible.isfinite()] == 1).all())
 
     def _simulate(
@@ -261,12 +263,6 @@ class CandidateSampler:
             return simulate(simulator, *rows, seed=seed, workers=self.workers)
 
 
-@dataclass(frozen=True)
-class _Reproducible:
-    """Says of rows whether the noise-free output is, where a fault costs no more."""
-
-    model: SimulatorModel
-
-    def __call__(self, theta: Tensor, action: Tensor) -> Tensor:
-        same = self.model.is_deterministic(theta, action)
-        return torch.full((len(theta), 1), float(same))
+def _reproducible(model: SimulatorModel, theta: Tensor, action: Tensor) -> Tensor:
+    """Say of rows whether the noise-free output is, where a fault costs no more."""
+    return torch.full((len(theta), 1), float(model.is_deterministic(theta, action)))

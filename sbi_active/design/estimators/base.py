@@ -33,8 +33,8 @@ class CandidateSimulations:
         sd: Standard deviations of the noise around the mean, as x, where rivals have
             noise of their own; else None.
         fisher: Information matrices of the simulator's own slopes, in units of the
-            noise, shape (a, n, theta_dim, theta_dim); NaN at most parameters, None for
-            none.
+            noise, shape (a, n, k, theta_dim, theta_dim), of each of k joint outcomes;
+            NaN at most parameters, None for none.
     """
 
     theta: Tensor
@@ -89,24 +89,25 @@ class CandidateSimulations:
 
     def candidates(self, index: Tensor) -> CandidateSimulations:
         """Return some candidates, index (k,)."""
-        parts = {name: part[index] for name, part in self._parts().items()}
+        parts = {name: part[index] for name, part in self.parts().items()}
         return replace(self, action=self.action[index], **parts)
 
     def samples(self, rows: slice) -> CandidateSimulations:
         """Return some of the simulations of every candidate."""
-        parts = {name: part[:, rows] for name, part in self._parts().items()}
+        parts = {name: part[:, rows] for name, part in self.parts().items()}
         return replace(self, theta=self.theta[rows], **parts)
 
     def join(self, other: CandidateSimulations) -> CandidateSimulations:
         """Return these and further simulations of the same candidates."""
-        more = other._parts()
+        more = other.parts()
         parts = {
             name: torch.cat([part, more[name]], 1)
-            for name, part in self._parts().items()
+            for name, part in self.parts().items()
         }
         return replace(self, theta=torch.cat([self.theta, other.theta]), **parts)
 
-    def _parts(self) -> dict[str, Tensor]:
+    def parts(self) -> dict[str, Tensor]:
+        """Return what there is of every simulation of every candidate, by name."""
         names = ("x", "mean", "replicate", "missing", "sd", "fisher")
         parts = {name: getattr(self, name) for name in names}
         return {name: part for name, part in parts.items() if part is not None}
@@ -209,6 +210,16 @@ class InformationGainEstimator(Shown, ABC):
         self, model: Any, simulations: CandidateSimulations, belief: Any
     ) -> Tensor:
         """Return the contributions, shape (a, n)."""
+
+
+def whitening(theta: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the center of rows (n, d) and what whitens them, (d,) and (d, d)."""
+    d = theta.shape[1]
+    size = theta.abs().amax(0).clamp_min(1e-30)
+    spread = torch.maximum(theta.std(0), 1e-9 * size)  # of draws that are all alike
+    covariance = torch.cov((theta / spread).T).reshape(d, d) + 1e-8 * torch.eye(d)
+    factor = torch.linalg.cholesky(covariance)
+    return theta.mean(0), torch.linalg.inv(factor).T / spread[:, None]
 
 
 def noise_scale(simulations: CandidateSimulations) -> Tensor:

@@ -8,7 +8,11 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from sbi_active.design.estimators.base import CandidateSimulations, noise_scale
+from sbi_active.design.estimators.base import (
+    CandidateSimulations,
+    noise_scale,
+    whitening,
+)
 from sbi_active.design.estimators.entropy import pair_noise
 from sbi_active.seeding import forked_generators
 from sbi_active.simulation import GaussianNoise
@@ -146,16 +150,6 @@ class MeanEmulator:
             for i in range(z.shape[1])
         ]
         return torch.stack(columns, -1)
-
-
-def whitening(theta: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the center of parameters and what whitens them, shapes (d,) and (d, d)."""
-    d = theta.shape[1]
-    size = theta.abs().amax(0).clamp_min(1e-30)
-    spread = torch.maximum(theta.std(0), 1e-9 * size)  # of draws that are all alike
-    covariance = torch.cov((theta / spread).T).reshape(d, d) + 1e-8 * torch.eye(d)
-    factor = torch.linalg.cholesky(covariance)
-    return theta.mean(0), torch.linalg.inv(factor).T / spread[:, None]
 
 
 def linear(z: Tensor) -> Tensor:

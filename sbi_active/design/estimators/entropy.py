@@ -17,6 +17,7 @@ from sbi_active.design.estimators.base import (
     InformationGainEstimator,
     at_least,
     noise_scale,
+    whitening,
 )
 from sbi_active.seeding import forked_generators
 
@@ -221,21 +222,17 @@ def nearest_neighbor_entropy(
             one to three dimensions, k = 1 to 10.
     """
     n, d = x.shape
-    center = x.mean(0)
-    scale = x.std(0).clamp_min(1e-30)
-    z = (x - center) / scale
-    covariance = torch.cov(z.T).reshape(d, d) + 1e-12 * torch.eye(d).double()
-    factor = torch.linalg.cholesky(covariance)
-    z = torch.linalg.solve_triangular(factor, z.T, upper=False).T
+    center, white = whitening(x)
+    z = (x - center) @ white
     tree = KDTree(z.numpy())
     k = min(num_neighbors + 1, n - 1)
     found, index = tree.query(z.numpy(), k=k + 1)
     # outcomes are float32: no two are closer than their rounding
     rounding = torch.finfo(torch.float32).eps
-    floor = rounding * float((x.abs().amax(0) / scale).max())
+    floor = rounding * float((x.abs().amax(0) / x.std(0).clamp_min(1e-30)).max())
     log_distance = d * torch.from_numpy(found).clamp_min(floor + 1e-300).log()
     log_ball = 0.5 * d * math.log(math.pi) - math.lgamma(0.5 * d + 1)
-    log_det = factor.diagonal().log().sum() + scale.log().sum()
+    log_det = -torch.linalg.slogdet(white).logabsdet
     constant = float(digamma(n) - digamma(num_neighbors)) + log_ball + log_det
     # a row shortens the distances of those that it is a neighbor of, an error that they
     # share: the balls around them would be larger without it

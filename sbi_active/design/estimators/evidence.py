@@ -10,7 +10,8 @@ import torch
 from torch import Tensor
 from torch.distributions import Distribution
 
-from sbi_active.design.estimators.emulator import Emulated, MeanEmulator, whitening
+from sbi_active.design.estimators.base import whitening
+from sbi_active.design.estimators.emulator import Emulated, MeanEmulator
 from sbi_active.inference.sampling.mixtures import log_student
 from sbi_active.seeding import forked_generators
 from sbi_active.simulation import GaussianNoise, NoiseModel

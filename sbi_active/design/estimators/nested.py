@@ -14,8 +14,9 @@ from sbi_active.design.estimators.base import (
     CandidateSimulations,
     InformationGainEstimator,
     at_least,
+    whitening,
 )
-from sbi_active.design.estimators.emulator import emulated, learned, whitening
+from sbi_active.design.estimators.emulator import emulated, learned
 from sbi_active.design.estimators.entropy import (
     EntropyGain,
     conditional_entropy,
@@ -106,7 +107,8 @@ class NestedGain(InformationGainEstimator):
             )
             if fisher is not None:
                 slope, theta = own @ known.emulator.transform.T, simulations.theta
-                gain[a] -= _excess(slope, fisher[a].double(), theta.double(), local)
+                every = fisher[a].sum(1)  # what noise of their own blurs adds up
+                gain[a] -= _excess(slope, every, theta.double(), local)
             # What a simulation does to the evidence of others has mean zero: it adds to
             # errors and leaves the estimate.
             effect = torch.where(counted, share - influence, 0.0)

@@ -8,7 +8,7 @@ import math
 import torch
 from sbi.utils import BoxUniform
 
-from sbi_active.design import EntropyGain, NestedGain
+from sbi_active.design import EntropyGain, InformationGainDesigner, NestedGain
 from sbi_active.design.estimators.base import CandidateSimulations
 from sbi_active.design.estimators.emulator import MeanEmulator, emulated
 from sbi_active.design.sampler import CandidateSampler
@@ -68,28 +68,44 @@ def test_six_numbers_that_four_parameters_make():
     assert (coarse - exact).abs().max() > 1.0
 
 
+SD = 0.003
+
+
+def shear(theta, action):
+    rough = 3 * torch.sin(20 * theta[:, :1])
+    return torch.cat([theta[:, :1], theta[:, 1:] + rough], 1)
+
+
+SHEAR = SimulatorModel(shear, noise=GaussianNoise(SD))
+
+
 def test_where_the_emulator_misses_slopes_of_the_simulator_count():
     """A rough shear keeps volumes: 11.6 nats; without slopes they were thousands."""
-    sd, action = 0.003, torch.zeros(1, 1)
-
-    def shear(theta, action):
-        rough = 3 * torch.sin(20 * theta[:, :1])
-        return torch.cat([theta[:, :1], theta[:, 1:] + rough], 1)
-
-    model = SimulatorModel(shear, noise=GaussianNoise(sd))
+    action = torch.zeros(1, 1)
     sampler = CandidateSampler(
-        *(model, PRIOR, action, 0, IN_PROCESS, torch.empty(0, 1), 200, True)
+        *(SHEAR, PRIOR, action, 0, IN_PROCESS, torch.empty(0, 1), 200, True)
     )
     rows = sampler.draw(300, action)
     assert NestedGain().needs_slopes(rows)
     sloped = sampler.add_slopes(rows)
     assert sampler.num_drawn == 300 + 2 * 64
     gain, error = estimate(sloped)
-    exact = -2 * math.log(sd)
+    exact = -2 * math.log(SD)
     assert abs(float(gain) - exact) < 3 * float(error) + BIAS
     assert float(error) < 0.3
     assert abs(float(estimate(rows)[0]) - exact) > 3 * float(error)  # negative control
     assert "slopes of the simulator" in NestedGain().remarks(sloped)[-1]
+
+
+def test_slopes_count_once_for_each_outcome():
+    """A second look halves the variance: log 2, where both outcomes need slopes."""
+    designer = InformationGainDesigner([0.0], num_samples=600, estimator="nested")
+    known = {"belief": PRIOR, "pending": torch.zeros(1, 1), "seed": 0}
+    design = designer.select(None, SHEAR, **known)
+    gain, error = design.expected_information_gain, design.standard_error
+    assert "slopes of the simulator" in design.notes[0]
+    assert abs(float(gain) - math.log(2)) < 3 * float(error) + BIAS
+    assert float(error) < 0.1
 
 
 def test_noise_that_is_not_declared_is_learned():
