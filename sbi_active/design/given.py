@@ -70,23 +70,20 @@ def design_given(
             f"expected simulations with at least {fewest} rows of a candidate; got "
             "fewer of every one; pass rows at the actions of the list"
         )
-    share = torch.full((len(action),), torch.nan).double()
-    gains = torch.full((2, len(action), -(-int(num.max()) // 2)), torch.nan).double()
-    for a in torch.nonzero(num >= fewest)[:, 0].tolist():
-        rows = torch.nonzero(near[:, a])[:, 0]
-        outcomes = CandidateSimulations(
-            *(given.theta[rows], action[a : a + 1], given.x[rows][None]),
-            missing=(given.status[rows] == Outcome.MISSING)[None],
-        )
-        valid, counted = outcomes.num_valid()
-        share[a] = valid / counted
-        for k in range(2):
-            half = outcomes.samples(slice(k, None, 2))
-            if estimator is None:
-                estimator = choose_estimator(model, half, belief)[0]
-            with single_thread():
-                gains[k, a, : len(half.theta)] = estimator(model, half, belief)[0]
-    eligible = (num >= fewest) & limits.reached_by(share)
+    near &= num >= fewest
+    known = near & (given.status != Outcome.MISSING)[:, None]
+    share = (known & (given.status == Outcome.OK)[:, None]).sum(0) / known.sum(0)
+    x = given.x.expand(len(action), *given.x.shape)
+    halves = [
+        CandidateSimulations(given.theta, action, x, missing=~(known & own).T)
+        for own in (near.cumsum(0) % 2 == 1, near.cumsum(0) % 2 == 0)
+    ]
+    estimator = estimator or choose_estimator(model, halves[0], belief)[0]
+    with single_thread():
+        gains = torch.stack([estimator(model, half, belief) for half in halves])
+    # No row is of two candidates: each has its own in front.
+    gains = gains.gather(2, gains.isnan().int().argsort(dim=2, stable=True))
+    eligible = limits.reached_by(share)
     index = torch.nonzero(eligible)[:, 0]
     race = Race(gains[0, index] / limits.cost(action)[index, None], seed)
     said = [IN_SAMPLE, *limits.excluded_note(eligible | (num < fewest))]
@@ -99,11 +96,11 @@ def design_given(
         eligible=eligible,
         leader=int(index[race.leader]),
         seed=seed,
-        probability_valid=share,
+        probability_valid=share.double(),
         estimator=type(estimator).__name__,
         bound="none",  # the model may have seen the rows
         num_simulations=0,
-        num_samples=num * (num >= fewest),
+        num_samples=near.sum(0),
         stopped="simulations given",
         notes=(*said, *notes),
     )
