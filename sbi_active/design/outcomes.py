@@ -23,7 +23,7 @@ from sbi_active.design.estimators.base import (
     CandidateSimulations,
     InformationGainEstimator,
 )
-from sbi_active.simulation import GaussianNoise, NoiseModel
+from sbi_active.simulation import NoiseModel
 
 
 def join_outcomes(
@@ -52,7 +52,7 @@ def join_outcomes(
     if candidates.missing is not None or others.missing is not None:
         parts["missing"] = ~candidates.counted | ~others.counted.all(0)
     action = torch.cat([candidates.action, beside], 1)
-    noise = None if candidates.noise is None else _joint(candidates.noise)
+    noise = None if candidates.noise is None else _JointNoise(candidates.noise)
     return replace(candidates, action=action, noise=noise, **parts)
 
 
@@ -96,7 +96,7 @@ class _JointNoise(NoiseModel):
     """Noise that is independent from outcome to outcome, each of the same model."""
 
     def __init__(self, each: NoiseModel) -> None:
-        self.each = each
+        self.each, self.is_known_gaussian = each, each.is_known_gaussian
 
     def sample(self, mean: Tensor, seeds: Tensor | None = None) -> Tensor:
         return self.each.sample(mean.flatten(0, 1), seeds).reshape(mean.shape)
@@ -107,13 +107,6 @@ class _JointNoise(NoiseModel):
 
     def whiten(self, value: Tensor) -> Tensor:
         return self.each.whiten(value.flatten(0, 1)).reshape(value.shape)
-
-
-def _joint(noise: NoiseModel) -> NoiseModel:
-    """Return the noise of stacked outcomes; a declared Gaussian is the same on any."""
-    if isinstance(noise, GaussianNoise) and noise.posterior is None:
-        return noise
-    return _JointNoise(noise)
 
 
 class LinearSummaries:
@@ -149,11 +142,6 @@ class LinearSummaries:
         self._noise, self._num_kept, self._num_rows = noise, num_kept, num_rows
         # Mean of the whitened outcomes of an action (N,), their directions (k, N).
         self._known: dict[bytes, tuple[Tensor, Tensor]] = {}
-
-    @property
-    def noise(self) -> GaussianNoise:
-        """The noise of the summaries."""
-        return GaussianNoise(1.0)
 
     def __call__(self, action: Tensor, mean: Tensor, *, block: int = 512) -> Tensor:
         """Return summaries, shape (n, k), NaN of an outcome that lacks any number.

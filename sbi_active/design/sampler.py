@@ -17,6 +17,7 @@ from sbi_active.design.estimators.base import CandidateSimulations, noise_scale
 from sbi_active.design.outcomes import LinearSummaries, join_outcomes
 from sbi_active.seeding import derive_seed, forked_generators, row_seeds
 from sbi_active.simulation import (
+    GaussianNoise,
     MissingRowsWarning,
     Outcome,
     Simulations,
@@ -166,7 +167,7 @@ class CandidateSampler:
             return None
         assert isinstance(self.simulator, SimulatorModel)
         short = self.summaries
-        noise = self.simulator.noise if short is None else short.noise
+        noise = self.simulator.noise if short is None else GaussianNoise(1.0)
         assert noise is not None
         seed = derive_seed(self.seed, label + "noise", self._num_waves)
         if label:  # they are not compared but measured together

@@ -14,7 +14,7 @@ from sbi_active.design.estimators.base import whitening
 from sbi_active.design.estimators.emulator import Emulated, MeanEmulator
 from sbi_active.inference.sampling.mixtures import log_student
 from sbi_active.seeding import forked_generators
-from sbi_active.simulation import GaussianNoise, NoiseModel
+from sbi_active.simulation import NoiseModel
 from sbi_active.support import within_support
 
 
@@ -161,35 +161,22 @@ class Evidence:
     def _linearized(self, x: Tensor, slope: Tensor, i: Tensor) -> tuple[Tensor, Tensor]:
         """Location and precision of the posterior given x, one step from theta_i.
 
-        The belief enters as the Gaussian of its draws' moments. A step is kept where
-        it does not raise the misfit.
+        The belief enters as the Gaussian of its draws' moments.
         """
         z, (center, white) = self.knots[i], whitening(self.knots)
         prior = white @ white.mT
-
-        def misfit(z: Tensor, outcome: Tensor) -> Tensor:
-            residual = x.flatten(1) / self.scale - outcome
-            return residual.square().sum(1) + ((z - center) @ prior * (z - center)).sum(
-                1
-            )
-
-        own = self.mean[i].flatten(1) / self.scale
-        residual = x.flatten(1) / self.scale - own
+        residual = (x - self.mean[i]).flatten(1) / self.scale
         precision = slope.mT @ slope + prior
         gradient = (slope.mT @ residual[..., None])[..., 0] - (z - center) @ prior
-        moved = z + torch.linalg.solve(precision, gradient[..., None])[..., 0]
-        after = self._outcomes(moved[:, None], slope, i)[:, 0]
-        better = misfit(moved, after) < misfit(z, own)
-        return torch.where(better[:, None], moved, z), precision
+        step = torch.linalg.solve(precision, gradient[..., None])[..., 0]
+        return z + step, precision
 
 
 def _pairwise(noise: NoiseModel, x: Tensor, mean: Tensor) -> Tensor:
     """Log density of every x (n, ...) at every mean (k, ...), shape (n, k)."""
-    if isinstance(noise, GaussianNoise) and noise.posterior is None:  # one product
-        sd = noise.sd.expand(x.shape[1:]).flatten()
-        log_peak = -(sd.log() + 0.5 * math.log(2 * math.pi)).sum()
-        square = torch.cdist(x.flatten(1) / sd, mean.flatten(1) / sd).square_()
-        return log_peak - 0.5 * square
+    if noise.is_known_gaussian:  # one product
+        white = (noise.whiten(part).flatten(1) for part in (x, mean))
+        return noise.log_prob(mean[:1], mean[:1]) - 0.5 * torch.cdist(*white).square_()
     n, k = len(x), len(mean)
     paired = noise.log_prob(
         x.repeat_interleave(k, 0), mean.repeat(n, *[1] * (x.ndim - 1))

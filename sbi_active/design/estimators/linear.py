@@ -117,12 +117,10 @@ class LinearGain(InformationGainEstimator):
                 "SimulatorModel(fn, noise=...) around a noise-free fn"
             )
         theta = self.target(simulations.theta).double()
-        gain = torch.full(mean.shape[:2], torch.nan, dtype=torch.float64)
+        gain = torch.zeros(mean.shape[:2]).double()  # what is lost tells nothing
         for a, row in enumerate(mean):
             y = noise.whiten(row).flatten(1)
             complete = y.isfinite().all(1)
-            # What is lost counts as knowing nothing.
-            gain[a] = 0.0
             gain[a, complete] = _jackknife(theta[complete], y[complete])
         return gain
 

@@ -212,12 +212,8 @@ class ModelIndexGain(InformationGainEstimator):
         log_p, own, fold = self.probability.log(), index[rows], block % NUM_FOLDS
         num_models = len(log_p)
         # the same members in every fold, or they could not be compared
-        each = torch.stack(
-            [
-                torch.bincount(fold[rows[own == k]], minlength=NUM_FOLDS)
-                for k in range(num_models)
-            ]
-        )
+        each = torch.zeros(num_models, NUM_FOLDS).long()
+        each.index_put_((own, fold[rows]), torch.ones_like(own), accumulate=True)
         enough = (each.sum(1) - each.amax(1)) >= self.few
 
         def score(train: Tensor, test: Tensor) -> Tensor:
