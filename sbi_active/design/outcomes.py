@@ -143,34 +143,29 @@ class LinearSummaries:
         # Mean of the whitened outcomes of an action (N,), their directions (k, N).
         self._known: dict[bytes, tuple[Tensor, Tensor]] = {}
 
-    def __call__(self, action: Tensor, mean: Tensor, *, block: int = 512) -> Tensor:
+    def __call__(self, action: Tensor, mean: Tensor) -> Tensor:
         """Return summaries, shape (n, k), NaN of an outcome that lacks any number.
 
         Args:
             action: Action, shape (action_dim,).
             mean: Noise-free outcomes at it, shape (n, *x_shape).
-            block: Number of rows in double precision at once.
         """
         found = torch.full((len(mean), self._num_kept), torch.nan).double()
-        key, rest = action.numpy().tobytes(), []
-        for rows, summaries in zip(mean.split(block), found.split(block), strict=True):
-            white = self._noise.whiten(rows).flatten(1)
-            whole = white.isfinite().all(1)
-            if not bool(whole.any()):
-                continue
-            if key not in self._known:
-                some = white[whole][: self._num_rows]
-                center = some.mean(0)
-                self._known[key] = center, leading(some - center, self._num_kept)
-            center, directions = self._known[key]
-            off = white[whole] - center
-            short = off @ directions.T
-            rest.append(off.square().sum(1) - short.square().sum(1))
-            padding = 0, self._num_kept - short.shape[1]
-            summaries[whole] = torch.nn.functional.pad(short, padding)
-        if rest:
-            lost = 0.5 * float(torch.cat(rest).mean().clamp_min(0.0))
-            self.left_out = max(self.left_out, lost)
+        key, white = action.numpy().tobytes(), self._noise.whiten(mean).flatten(1)
+        whole = white.isfinite().all(1)
+        if not bool(whole.any()):
+            return found
+        if key not in self._known:
+            some = white[whole][: self._num_rows]
+            center = some.mean(0)
+            self._known[key] = center, leading(some - center, self._num_kept)
+        center, directions = self._known[key]
+        off = white[whole] - center
+        short = off @ directions.T
+        lost = 0.5 * float((off.square().sum(1) - short.square().sum(1)).mean())
+        self.left_out = max(self.left_out, lost)
+        padding = 0, self._num_kept - short.shape[1]
+        found[whole] = torch.nn.functional.pad(short, padding)
         return found
 
     def note(self, num_numbers: int) -> str:

@@ -178,7 +178,7 @@ class CandidateSampler:
         return CandidateSimulations(theta, action, x, mean, noise, missing=missing)
 
     def _means(
-        self, theta: Tensor, action: Tensor, key: str, *, block: int = 768
+        self, theta: Tensor, action: Tensor, key: str, *, block: int = 512
     ) -> tuple[Tensor, Tensor]:
         """Return noise-free outcomes (a, n, *x_shape) and which are missing (a, n).
 

@@ -79,13 +79,11 @@ class EntropyGain(InformationGainEstimator):
                 few = int(rows.sum()) <= max(self.num_neighbors, x[a, 0].numel())
                 if few or bool(entropy[a, rows].isnan().any()):
                     continue  # too few measurements: what is present still counts
-                log_density = -nearest_neighbor_entropy(
-                    x[a, rows].flatten(1).double(), self.num_neighbors
-                )
-                gain[a, rows] += with_control(
-                    -log_density - entropy[a, rows],
-                    surprise[a, rows] - entropy[a, rows],
-                ) / len(outcomes)
+                own = x[a, rows].flatten(1).double()
+                told = nearest_neighbor_entropy(own, self.num_neighbors)
+                noise = entropy[a, rows]
+                told = with_control(told - noise, surprise[a, rows] - noise)
+                gain[a, rows] += told / len(outcomes)
         return gain
 
     @override
