@@ -114,11 +114,8 @@ class Design:
         return drawn
 
 
-def equal_errors(error: Tensor) -> dict[str, Any]:
-    """Return the fields of a :class:`Design` for errors that are all alike.
-
-    Args:
-        error: NaN where not known, shape (a,).
-    """
-    kinds = ("standard_error", "difference_standard_error", "probability_best")
-    return dict.fromkeys(kinds, error)
+def unknown_errors(num: int) -> dict[str, Any]:
+    """Return errors and shares of a :class:`Design` of so many candidates, all NaN."""
+    kinds = "standard_error", "difference_standard_error"
+    shares = "probability_best", "probability_valid"
+    return dict.fromkeys(kinds + shares, torch.full((num,), torch.nan).double())

@@ -230,8 +230,8 @@ class GainEvaluator:
         first = self.draw(size, action, halves=True)
         said = [*(self.notes or ()), *self.estimator.remarks(first)]
         halves = _halves(first)
-        num_valid, num_counted = first.num_valid()
-        eligible = limits.reached_by(num_valid / num_counted)
+        num = first.num_valid()
+        eligible = limits.reached_by(num[0] / num[1])
         said += limits.excluded_note(eligible)
         cost = limits.cost(action)
         weight = (cost.mean() / cost)[:, None]
@@ -241,9 +241,8 @@ class GainEvaluator:
         def estimate(index: Tensor, halves: list[CandidateSimulations]) -> Tensor:
             """Return all gains with those of some candidates, NaN where none is."""
             found = torch.stack([self(half) for half in halves])
-            num = found.shape[2]
-            spent[index] = 2 * num * runs
-            padding = 0, num - gains.shape[2]
+            spent[index] = 2 * found.shape[2] * runs
+            padding = 0, found.shape[2] - gains.shape[2]
             every = torch.nn.functional.pad(gains, padding, value=torch.nan)
             every[:, index] = found
             return every
@@ -263,9 +262,7 @@ class GainEvaluator:
                 break
             active = active[keep]
             drawn = self.draw(more, action[active])
-            counts = (num_valid, num_counted), drawn.num_valid()
-            for count, new in zip(*counts, strict=True):
-                count[active] += new
+            num[:, active] += drawn.num_valid()
             halves = [
                 half.candidates(keep).join(new)
                 for half, new in zip(halves, _halves(drawn), strict=True)
@@ -280,7 +277,7 @@ class GainEvaluator:
             eligible=eligible,
             leader=int(active[race.leader]),
             seed=self.seed,
-            probability_valid=num_valid / num_counted.double(),
+            probability_valid=num[0] / num[1].double(),
             num_samples=spent,
             estimator=type(self.estimator).__name__,
             # A difference of two bounds is none.

@@ -10,7 +10,7 @@ from torch import Tensor
 from torch.distributions import Distribution
 
 from sbi_active.actions.discrete import Actions, action_space
-from sbi_active.design.design import Design, equal_errors
+from sbi_active.design.design import Design, unknown_errors
 from sbi_active.design.limits import DesignLimits
 from sbi_active.expected import Shown, suggests
 from sbi_active.seeding import derive_seed, forked_generators
@@ -62,13 +62,11 @@ class RandomDesigner(Shown):
         num = len(candidates)
         with forked_generators(seed):
             chosen = int(torch.randint(num, ()))
-        unknown = torch.full((num,), torch.nan, dtype=torch.float64)
         return Design(
             action=candidates[chosen],
             candidates=candidates,
-            expected_information_gain=unknown,
-            **equal_errors(unknown),
-            probability_valid=unknown,
+            expected_information_gain=torch.full((num,), torch.nan).double(),
+            **unknown_errors(num),
             bound="none",
             index=chosen,
             num_simulations=0,

@@ -17,7 +17,7 @@ from sbi_active.campaign.learning.methods import find_method
 from sbi_active.campaign.learning.pooled import PooledLearner
 from sbi_active.campaign.learning.revision import compare
 from sbi_active.campaign.state import CampaignState, Trial
-from sbi_active.design.design import Design, equal_errors
+from sbi_active.design.design import Design, unknown_errors
 from sbi_active.design.designer import InformationGainDesigner
 from sbi_active.design.estimators.automatic import ESTIMATORS
 from sbi_active.design.limits import Cost, DesignLimits
@@ -347,13 +347,11 @@ def _model_design(criticism: Criticism, limits: DesignLimits) -> Design | None:
     action = torch.as_tensor(found.action).float()
     index = int((candidates == action).all(1).int().argmax())
     index = index if cost is None else int((gain / cost).argmax())
-    unknown = torch.full((len(candidates),), torch.nan, dtype=torch.float64)
     return Design(
         action=candidates[index],
         candidates=candidates,
         expected_information_gain=gain,
-        **equal_errors(unknown),
-        probability_valid=unknown,
+        **unknown_errors(len(candidates)),
         bound="lower",
         index=index,
         num_simulations=criticism.rivals.simulator.num_simulations - spent,

@@ -75,13 +75,13 @@ class CandidateSimulations:
         present = self.present
         return (present.any(-1) & ~present.all(-1)).any(0) & self.counted
 
-    def num_valid(self) -> tuple[Tensor, Tensor]:
-        """Return the numbers of outcomes with a measurement, and of all, both (a,).
+    def num_valid(self) -> Tensor:
+        """Return the numbers of outcomes with a measurement, and of all, shape (2, a).
 
         A partly observed outcome has one; missing rows are not counted.
         """
         valid = self.present.any(-1) & self.counted
-        return valid.sum((0, 2)), len(valid) * self.counted.sum(1)
+        return torch.stack([valid.sum((0, 2)), len(valid) * self.counted.sum(1)])
 
     def outcomes(self) -> list[Tensor]:
         """Return x and, where there are any, replicates."""

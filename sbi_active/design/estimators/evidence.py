@@ -120,25 +120,17 @@ class Evidence:
         ratio = math.log(num_local / (len(self.knots) - 1))
         step = _student((n, num_local, d), self.degrees) @ factor.mT
         z = location[:, None] + step
-        flat = z.flatten(0, 1)
-        log_b = _log_belief(self.belief, self.known.emulator, flat).reshape(
-            n, num_local
-        )
-        inside = torch.nonzero(log_b.flatten().isfinite())[:, 0]
-        mean = self._outcomes(z, slope, i).flatten(0, 1)[inside] * self.scale
-        outcome = x.repeat_interleave(num_local, 0)[inside]
-        local = torch.full((n * num_local,), -torch.inf).double()
-        local[inside] = self.noise.log_prob(outcome, mean.reshape(outcome.shape))
-        log_t = _log_student(z - location[:, None], factor, self.degrees)
-        local[inside] += self._log_complete(flat[inside])
-        local = local.reshape(n, num_local) - torch.nn.functional.softplus(
-            ratio + torch.where(log_b.isfinite(), log_t - log_b, 0.0)
-        )
+        flat, outcome = z.flatten(0, 1), x.repeat_interleave(num_local, 0)
+        log_b = _log_belief(self.belief, self.known.emulator, flat)
+        mean = (self._outcomes(z, slope, i) * self.scale).reshape(outcome.shape)
+        local = self.noise.log_prob(outcome, mean) + self._log_complete(flat)
+        log_t = _log_student(step, factor, self.degrees).flatten()
+        local = local - torch.nn.functional.softplus(ratio + log_t - log_b)
         log_t = _log_student(self.knots - location[:, None], factor, self.degrees)
         shared = shared - torch.nn.functional.softplus(ratio + log_t - self.log_belief)
         least = self.noise.log_prob(x, self.mean[i]) + self.log_belief[i]
         least += 0.5 * (d * math.log(math.pi / 2) - torch.logdet(precision))
-        return torch.cat([shared, local], 1), least
+        return torch.cat([shared, local.reshape(n, num_local)], 1), least
 
     def _outcomes(self, z: Tensor, slope: Tensor, i: Tensor) -> Tensor:
         """Noise-free outcomes at z (i, k, d) around simulations i, (i, k, q)."""
@@ -175,8 +167,9 @@ class Evidence:
 def _pairwise(noise: NoiseModel, x: Tensor, mean: Tensor) -> Tensor:
     """Log density of every x (n, ...) at every mean (k, ...), shape (n, k)."""
     if noise.is_known_gaussian:  # one product
-        white = (noise.whiten(part).flatten(1) for part in (x, mean))
-        return noise.log_prob(mean[:1], mean[:1]) - 0.5 * torch.cdist(*white).square_()
+        white, other = (noise.whiten(part).flatten(1) for part in (x, mean))
+        peak = noise.log_prob(mean[:1], mean[:1])
+        return peak - 0.5 * torch.cdist(white, other).square_()
     n, k = len(x), len(mean)
     paired = noise.log_prob(
         x.repeat_interleave(k, 0), mean.repeat(n, *[1] * (x.ndim - 1))
