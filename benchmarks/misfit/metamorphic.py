@@ -7,7 +7,8 @@ A case of :mod:`benchmarks.misfit.cases`, its kind by turns, is judged as it is 
 again after each change: "irrelevant", four more declared effects that explain nothing;
 "units", outcomes in thousandths of their unit; "finer", the sensor declared ten times
 finer than it is; "denser", four times as many samples of the same trials, where there
-are any; "order", the effects declared in the opposite order. The same names are due.
+are any, of a sensor with twice the error, so that together they tell as much; "order",
+the effects declared in the opposite order. The same names are due.
 With a finer sensor a clean case misses it, which is true; its names are due
 nevertheless.
 
@@ -87,7 +88,7 @@ def finer(case: Case) -> Problem:
 
 
 def denser(case: Case) -> Problem | None:
-    """Return the problem with more samples of the same trials; None if it has none."""
+    """Return the problem with more samples that tell as much; None if it has none."""
     truth = case.truth
     what = truth.discrepancy
     if truth.machine.name not in GROUPS["own"]:
@@ -96,15 +97,17 @@ def denser(case: Case) -> Problem | None:
         return None
     num_trials, num_samples = truth.machine.num_trials, truth.error.shape[1]
     machine = get_machine(truth.machine.name, (num_trials, DENSER * num_samples))
+    machine = replace(machine, noise_sd=DENSER**0.5 * machine.noise_sd)
+    # Independent errors of this size, whose mean over each sample's is what it had.
+    shape = *truth.error.shape[:2], DENSER, *truth.error.shape[2:]
     with forked_generators(derive_seed(len(truth.action), "denser")):
-        shape = len(truth.error), DENSER * truth.error.shape[1], *truth.error.shape[2:]
         error = machine.noise_sd * torch.randn(shape, dtype=torch.float64)
-    error[:, DENSER - 1 :: DENSER] = truth.error
+    error = error - error.mean(2, keepdim=True) + truth.error[:, :, None]
     kept = {own.name for own in case.problem.effects}
     more = replace(
         truth,
         machine=machine,
-        error=error,
+        error=error.flatten(1, 2),
         effects=tuple(machine.effect(name) for name in truth.names),
     )
     return Problem(
