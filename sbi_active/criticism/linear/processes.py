@@ -32,8 +32,7 @@ class Processes:
 
     Attributes:
         white: Variance of the white part, a, shape (h,).
-        process: Variance of the process, b, shape (h,); or (h, s) where it is another
-            one in each of s series that are whitened together.
+        process: Variance of the process, b, shape (h,).
         time: Scale of the process, shape (h,).
         smooth: Whether the kernel is the Matérn one, bool, shape (h,).
     """
@@ -242,7 +241,7 @@ class Filter:
         most: Whitened numbers in memory at once, 16 MB.
 
     Attributes:
-        log_det: Log determinant of the covariance, shape (h,), or (h, s).
+        log_det: Log determinant of the covariance, shape (h,).
     """
 
     def __init__(
@@ -251,11 +250,9 @@ class Filter:
         p, n = processes, len(time)
         self.most = most
         self.first_smooth = int((~p.smooth).sum())
-        process = p.process if p.process.ndim == 2 else p.process[:, None]
-        white = p.white[:, None]
-        smooth = p.smooth[:, None]
+        process, white, smooth = p.process, p.white, p.smooth
         # In units in which both states have the variance of the process.
-        a = np.diff(time)[:, None, None] / p.time[:, None]
+        a = np.diff(time)[:, None] / p.time
         b = np.sqrt(3) * a
         decay = np.exp(-np.where(smooth, b, a))
         xx = np.where(smooth, 1 + b, 1.0) * decay
@@ -283,12 +280,10 @@ class Filter:
             cxv = m * (o * dxv - k * dxx) + k * (o * dvv - k * dxv)
             cvv = process + k * (k * dxx - o * dxv) + o * (o * dvv - k * dxv)
         self.log_det = np.log(deviation).sum(0)
-        if p.process.ndim == 1:
-            self.log_det = self.log_det[:, 0]
-        self._scale = 1 / np.sqrt(deviation)[..., None]
-        self._gains = gains[..., None]
+        self._scale = 1 / np.sqrt(deviation)[..., None, None]
+        self._gains = gains[..., None, None]
         some = self.first_smooth
-        self._moves = [p[..., None] for p in (xx, xv[:, some:], vv[:, some:])]
+        self._moves = [p[..., None, None] for p in (xx, xv[:, some:], vv[:, some:])]
 
     def grams(self, series: Array) -> Array:
         """Return the Gram matrices of whitened series, (h, b, k, k), of (b, n, k)."""

@@ -24,7 +24,6 @@ from sbi_active.criticism.linear.processes import white_variance
 from sbi_active.criticism.linear.search import Search
 from sbi_active.criticism.linear.states import States
 from sbi_active.criticism.misfit.guesses import gained_by_guesses
-from sbi_active.criticism.misfit.intervals import covariance
 from sbi_active.criticism.misfit.rule import Choice, Compared, Rule
 from sbi_active.criticism.misfit.scored import Scored
 from sbi_active.criticism.results import (
@@ -74,7 +73,6 @@ class Verdict:
         self.rivals = self.search.rivals
         self.states = States(self.search, self.rule.chance)
         self.timed = self.rivals.measurements.is_sequence
-        self._covariances: dict[ModelKey, Array] = {}
 
     @cached_property
     def detection(self) -> Detection:
@@ -294,9 +292,14 @@ class Verdict:
         return self.is_missed or (self.search.sensor.is_known and misses)
 
     def shown(self, key: ModelKey) -> Array:
-        """Return the covariance that intervals of a model's coordinates have, (d, d).
+        r"""Return the covariance that intervals of a model's coordinates have, (d, d).
 
-        It has what larger models say, and the jackknife.
+        .. math::
+            \Sigma + \Sigma_J + \sum_m p_m (\hat u_m - \hat u) (\hat u_m - \hat u)^T
+
+        with the jackknife's, which knows no process, and the models m that have further
+        effects, as probable as they are beside a process: something undeclared may be
+        what they take up. On tuning seeds of ``benchmarks/misfit`` each term is needed.
         """
         search, own = self.search, self.search.found[key]
         larger = [k for k in search.found if {*k.effects} >= {*key.effects}]
@@ -307,16 +310,22 @@ class Verdict:
         return self.covariance(key) + own.left.jackknife() + spread
 
     def covariance(self, key: ModelKey) -> Array:
-        """Return the covariance of a model's coordinates about its best fit, (d, d).
+        r"""Return the covariance of a model's coordinates about its best fit, (d, d).
 
-        Predictions have it; intervals have what larger models say besides.
+        .. math::
+            \Sigma = \Sigma_{GLS} + \Delta \Delta^T, \qquad
+            \Delta = \hat u_{LSQ} - \hat u_{GLS}
+
+        with that of generalized least squares given a residual process, or a parameter
+        that differs from trial to trial. What weighting the same residuals differently
+        moves parameters by is an error of them too, beyond a bound of the prior as
+        well, where the fit stays. It is one matrix, in which parameters make up for
+        each other as they do in the trials, so that predictions follow from it. The
+        center is that of least squares, which predicts new trials better.
         """
-        if key not in self._covariances:
-            action = self.rivals.trials.action.numpy()
-            action = action[np.unique(self.rivals.measurements.trial)]
-            given = self.search.found[key], self.search.errors, action
-            self._covariances[key] = covariance(*given)
-        return self._covariances[key]
+        own = self.search.found[key]
+        apart = own.model.u - own.beside.mean
+        return own.beside.cov + np.outer(apart, apart)
 
     def chosen_by(self, use: NDArray[np.bool_]) -> ModelKey:
         """Return the model that is chosen by some parts of the trials.

@@ -1,7 +1,5 @@
 """The evidence under a residual process, against dense Gaussian integrals."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from scipy.special import softmax
@@ -12,8 +10,6 @@ from sbi_active.criticism.data.trials import Trials
 from sbi_active.criticism.linear.errors import Errors
 from sbi_active.criticism.linear.left_out import leave_out
 from sbi_active.criticism.linear.mixture import WIDTHS, integrated
-from sbi_active.criticism.misfit.intervals import shared_process
-from sbi_active.criticism.results import ModelKey
 from sbi_active.criticism.rivals.error_models import LOG_2PI, NoiseCell, NoiseGrid
 from tests.criticism.linear.linear_models import linear_model
 
@@ -153,41 +149,6 @@ def test_left_out_errors_are_those_of_refits():
         error = rows[~rest, 0] - rows[~rest, 1:] @ fit
         assert left.refits[k] == pytest.approx(fit)
         assert left.square[k] == pytest.approx(np.mean(error**2))
-
-
-@pytest.mark.parametrize("effects", [(), ("a",)])
-@pytest.mark.parametrize("differs", [False, True])
-def test_an_error_that_trials_share_is_that_of_the_dense_integral(differs, effects):
-    model, errors = problem(differs=differs)
-    model, widths = replace(model, key=ModelKey(effects)), WIDTHS if effects else [1.0]
-    m, action = errors.measurements, np.linspace(-1, 1, NUM)[:, None]
-    mean, cov = shared_process(model, errors, action)
-    square = (action - action.T) ** 2 / action.var()
-    between = [np.eye(NUM)]
-    for share in (0.5, 0.9):
-        for length in (0.7, 1e3):
-            shared = share * np.exp(-0.5 * square / length**2)
-            between.append(shared + (1 - share) * np.eye(NUM))
-    apart = np.abs(m.time[:, None] - m.time)
-    along = [shape(apart / tau) for shape in KERNELS for tau in errors.times]
-    columns = (model.jacobian / np.sqrt((model.jacobian**2).mean(0))).T
-    parts = []
-    for kernels in (along, [np.outer(j, j) for j in columns])[: 1 + differs]:
-        covariances = [
-            np.eye(len(m)) + size**2 * inside * a[m.trial[:, None], m.trial]
-            for inside in kernels
-            for a in between
-            for size in errors.sizes[::2]
-        ]
-        sds = [model.widened(width) for width in widths]
-        logs, means, covs = dense(model, covariances, sds)
-        parts.append((logs - np.log(len(logs)), means, covs))
-    logs, means, covs = (np.concatenate(part) for part in zip(*parts, strict=True))
-    p = softmax(logs)
-    assert mean == pytest.approx(p @ means, rel=1e-6)
-    off = means - p @ means
-    exact = np.einsum("h,hij->ij", p, covs) + (p[:, None] * off).T @ off
-    assert cov == pytest.approx(exact, rel=1e-6)
 
 
 @pytest.mark.parametrize("far", [1.0, 1e6])
