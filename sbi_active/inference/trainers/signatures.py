@@ -27,11 +27,13 @@ def given_arguments(
 ) -> dict[str, Any]:
     """Return by name the arguments that a call of a method of sbi's was given.
 
-    None stands for sbi's default, but as ``clip_max_norm``, where it says not to clip.
+    None is left out where it is sbi's default, and is sbi's to refuse elsewhere.
     """
-    given = inspect.signature(method).bind(*args, **kwargs).arguments
+    signature = inspect.signature(method)
+    given = signature.bind(*args, **kwargs).arguments
+    defaults = signature.parameters
     return {
         name: value
         for name, value in given.items()
-        if value is not None or name == "clip_max_norm"
+        if value is not None or defaults[name].default is not None
     }

@@ -151,6 +151,15 @@ def test_methods_take_what_sbi_takes_in_the_same_order(trainer):
             ]
 
 
+def test_none_is_sbi_s_to_refuse_where_it_is_not_its_default():
+    """It was taken for the default, whatever that is."""
+    theta = PRIOR.sample((100,))
+    inference = ASBI(PRIOR).append_simulations(theta, theta)
+    with pytest.raises(TypeError, match="discard_prior_samples"):
+        inference.train(discard_prior_samples=None)
+    inference.train(clip_max_norm=None, calibration_kernel=None, max_num_epochs=1)
+
+
 @pytest.mark.parametrize("trainer", PARENTS)
 def test_hooks_of_sbi_have_the_signatures_we_override(trainer):
     """A new sbi that changes one fails here and nowhere else."""
