@@ -22,9 +22,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
+import torch
 
 from sbi_active.arrays import Array
 from sbi_active.criticism.data.measurements import Measurements
@@ -32,9 +32,10 @@ from sbi_active.criticism.data.trials import Trials
 from sbi_active.criticism.linear.fits import JUMPING, FitSettings, best_fit, sensor_of
 from sbi_active.criticism.linear.library import Library
 from sbi_active.criticism.linear.model import LinearModel
+from sbi_active.criticism.linear.processes import series_of
 from sbi_active.criticism.linear.search import Search
 from sbi_active.criticism.results import ModelKey
-from sbi_active.criticism.rivals.error_models import measurement_sds
+from sbi_active.criticism.rivals.error_models import NoiseCell, measurement_sds
 from sbi_active.criticism.rivals.rival_set import RivalSet
 from sbi_active.criticism.steps.equivalence import MANY
 
@@ -87,7 +88,7 @@ class Sampling:
         return self.every * self.step
 
 
-def suggested_sampling(trials: Trials, residuals: Any, times: Any = None) -> Sampling:
+def suggested_sampling(m: Measurements, residual: Array) -> Sampling:
     """Return the sampling of trials, and the sampling that they need.
 
     The needed rate is the first one, from high to low, at which neighboring innovations
@@ -97,10 +98,8 @@ def suggested_sampling(trials: Trials, residuals: Any, times: Any = None) -> Sam
     left.
 
     Args:
-        trials: Trials with sample times.
-        residuals: Residuals that a fitted model leaves, of the shape of x (n, k, ...),
-            NaN where nothing was measured.
-        times: Sample times, shape (k,) or (n, k), where the trials have none.
+        m: Measurements with a time axis.
+        residual: Residuals that a fitted model leaves, shape (N,).
 
     References:
         Ljung, System Identification, 2nd edition, 1999, section 16.6: residuals that
@@ -110,28 +109,21 @@ def suggested_sampling(trials: Trials, residuals: Any, times: Any = None) -> Sam
         >>> import torch
         >>> times = torch.linspace(0, 10, 400)
         >>> x = torch.stack([(times + shift).sin() for shift in (0.0, 1.0, 2.0)])
-        >>> trials = Trials(torch.arange(3.0), x, sample_times=times)
-        >>> suggested_sampling(trials, x).every > 10
+        >>> m = Measurements.of(Trials(torch.arange(3.0), x, sample_times=times))
+        >>> suggested_sampling(m, m.x).every > 10
         True
     """
-    r = np.asarray(residuals, dtype=float)
-    n, k = r.shape[:2]
-    r = r.reshape(n, k, -1)
-    size = np.sqrt(np.nanmean(r**2, axis=(0, 1)))
-    series = (r / np.where(size > 0, size, 1.0)).transpose(0, 2, 1).reshape(-1, k)
-    stamps = np.repeat(_stamps(trials, times), r.shape[2], axis=0)
+    size = np.sqrt(m.by_channel(residual**2))
+    r = residual / np.where(size > 0, size, 1.0)[m.channel]
     # Each trial and channel by its own samples, whatever others have between them.
-    order = np.argsort(~np.isfinite(series), axis=1, kind="stable")
-    series = np.take_along_axis(series, order, 1)
-    stamps = np.take_along_axis(stamps, order, 1)
-    stamps = np.where(np.isfinite(series), stamps, np.nan)
-    gaps = np.diff(stamps, axis=1)
-    step = float(np.nanmedian(gaps)) if np.isfinite(gaps).any() else 1.0
-    count = int(np.median(np.isfinite(series).sum(1)))
+    series = series_of(m, 0 * m.trial)
+    place = np.concatenate([1 + np.arange(len(at)) for at in series])
+    count = int(np.median([len(at) for at in series]))
     found: list[float] = []
     is_hidden = True  # and may yet show
     for every in range(1, max(count // NEED.fewest, 1) + 1):
-        correlation, num = _innovations(series, stamps, every)
+        kept = place % every == 0
+        correlation, num = _innovations(m.part(kept), r[kept])
         found.append(correlation)
         if not _independent(correlation, num):
             is_hidden = False
@@ -139,14 +131,16 @@ def suggested_sampling(trials: Trials, residuals: Any, times: Any = None) -> Sam
             break
     every = 1 if is_hidden else len(found)
     return Sampling(
-        step=step,
+        step=m.step,
         every=every,
         before=found[0] if every == 1 else max(found[:-1]),
         after=found[every - 1],
     )
 
 
-def thinned(trials: Trials, sampling: Sampling, times: Any = None) -> Trials:
+def thinned(
+    trials: Trials, sampling: Sampling, model_times: Array | None = None
+) -> Trials:
     """Return trials of which only samples as far apart as suggested count as measured.
 
     The others are masked, in each trial and channel by itself: times and other inputs
@@ -156,31 +150,20 @@ def thinned(trials: Trials, sampling: Sampling, times: Any = None) -> Trials:
     Args:
         trials: Trials with x of shape (n, k, ...).
         sampling: Sampling that was found.
-        times: Sample times, as in :func:`suggested_sampling`.
+        model_times: The simulator's sample times, shape (k,), where the trials have
+            none.
     """
-    found = trials.select(slice(None))
-    n, k = trials.x.shape[:2]
-    stamps = _stamps(trials, times)
-    x = found.x.reshape(n, k, -1)
-    for i in range(n):
-        for channel in x[i].T:
-            place = np.flatnonzero(channel.isfinite().numpy())
-            if not len(place):
-                continue
-            at, apart = stamps[i, place], sampling.suggested_step - 0.5 * sampling.step
-            kept, last = [], at[0] - sampling.step
-            while (following := np.searchsorted(at, last + apart)) < len(at):
-                kept.append(following)
-                last = at[following]
-            keep = place[kept or [-1]]
-            channel[np.setdiff1d(np.arange(k), keep)] = float("nan")
+    found, m = trials.select(slice(None)), Measurements.of(trials, model_times)
+    masked, apart = m.time < np.inf, sampling.suggested_step - 0.5 * sampling.step
+    for at in series_of(m, 0 * m.trial):
+        kept, stamps = [], m.time[at]
+        last = stamps[0] - sampling.step
+        while (following := np.searchsorted(stamps, last + apart)) < len(at):
+            kept.append(following)
+            last = stamps[following]
+        masked[at[kept or [-1]]] = False
+    found.x.view(-1)[torch.from_numpy(m.position[masked])] = torch.nan
     return found
-
-
-def _stamps(trials: Trials, times: Any) -> Array:
-    """Return sample times, shape (n, k)."""
-    stamps = trials.sample_times if times is None else times
-    return np.broadcast_to(np.asarray(stamps, dtype=float), trials.x.shape[:2])
 
 
 def _independent(correlation: float, num: int) -> bool:
@@ -188,39 +171,29 @@ def _independent(correlation: float, num: int) -> bool:
     return correlation <= max(NEED.independent, NEED.significant / np.sqrt(max(num, 1)))
 
 
-def _innovations(series: Array, stamps: Array, every: int) -> tuple[float, int]:
+def _innovations(m: Measurements, r: Array) -> tuple[float, int]:
     """Return the correlation of neighboring innovations, and how many pairs there are.
 
     Args:
-        series: Residuals, one a trial and channel, shape (s, k), NaN where missing.
-        stamps: Times of the samples, of the same shape.
-        every: Interval of the samples that are kept: every 1st, 2nd, ...
+        m: Measurements that are kept.
+        r: Their residuals, shape (N,).
     """
-    r, t = series[:, every - 1 :: every], stamps[:, every - 1 :: every]
-    gaps = np.diff(t, axis=1)
-    if gaps.shape[1] < 2 or not np.isfinite(gaps).any():
+    follows = np.isfinite(m.gap)
+    pairs = follows[1:] & follows[:-1]
+    if not pairs.any():
         return 0.0, 0
-    step, span = np.nanmedian(gaps), np.nanmax(t) - np.nanmin(t)
-    best, chosen = -np.inf, np.zeros((len(r), 0))
-    for tau in np.geomspace(
-        NEED.shortest * step, max(NEED.longest * span, step), NEED.num_times
-    ):
-        variance = -np.expm1(-2 * gaps / tau)
-        e = (r[:, 1:] - np.exp(-gaps / tau) * r[:, :-1]) / np.sqrt(variance)
-        seen = np.isfinite(e)
-        first = r[:, :1][np.isfinite(r[:, :1])]
-        num = seen.sum() + len(first)
-        square = (e[seen] ** 2).sum() + (first**2).sum()
-        log_p = -0.5 * num * np.log(max(square / num, 1e-300))
-        log_p -= 0.5 * np.log(variance[seen]).sum()
+    ends = NEED.shortest * m.step, max(NEED.longest * m.span, m.step)
+    best, e = -np.inf, r
+    for tau in np.geomspace(*ends, NEED.num_times):
+        cell = NoiseCell.of(m, sd=np.ones(len(m)), correlation_time=tau)
+        new = cell.whiten(r)
+        log_p = -0.5 * len(r) * np.log(max((new**2).mean(), 1e-300)) - cell.log_scale
         if log_p > best:
-            best, chosen = log_p, e
-    one, two = chosen[:, :-1], chosen[:, 1:]
-    both = np.isfinite(one) & np.isfinite(two)
-    power = float((chosen[np.isfinite(chosen)] ** 2).mean()) if both.any() else 0.0
+            best, e = log_p, new
+    power = float((e[follows] ** 2).mean())
     if power == 0:
         return 0.0, 0
-    return float((one[both] * two[both]).mean() / power), int(both.sum())
+    return float((e[:-1] * e[1:])[pairs].mean() / power), int(pairs.sum())
 
 
 #: Effects whose pairs are compared, best alone, and effects that are fitted: with 24,
@@ -319,19 +292,15 @@ def thinned_to_need(rivals: RivalSet, trials: Trials) -> tuple[Trials, Sampling 
         The trials, as they are where nothing is to be left out; and what was found of
         their sampling, None if it was not looked at.
     """
-    fit = rivals.trials
-    own = fit.sample_times is not None
-    times = fit.sample_times if own else rivals.model.sample_times
-    if (
-        times is None
-        or measurement_sds(rivals.model.noise, rivals.measurements) is None
-    ):
+    m, model_times = rivals.measurements, rivals.model.sample_times
+    if rivals.trials.sample_times is None and model_times is None:
+        return trials, None
+    if measurement_sds(rivals.model.noise, m) is None:
         return trials, None
     sensor = sensor_of(rivals)
     bare = Search(rivals, sensor).model(ModelKey())
-    left = np.full(fit.x.numel(), np.nan)
-    left[rivals.measurements.position] = sensor.unit * bare.residual
-    sampling = suggested_sampling(fit, left.reshape(fit.x.shape), times)
+    sampling = suggested_sampling(m, sensor.unit * bare.residual)
     if sampling.every == 1:
         return trials, sampling
-    return thinned(trials, sampling, trials.sample_times if own else times), sampling
+    times = None if model_times is None else model_times.double().numpy()
+    return thinned(trials, sampling, times), sampling

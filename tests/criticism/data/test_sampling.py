@@ -5,6 +5,7 @@ import pytest
 import torch
 
 from sbi_active.criticism import Trials
+from sbi_active.criticism.data.measurements import Measurements
 from sbi_active.criticism.linear.screening import Sampling, suggested_sampling, thinned
 from tests.effects import autocorrelated
 
@@ -14,6 +15,11 @@ STEP = 0.02
 def trials_of(x, step=STEP):
     times = step * torch.arange(1, x.shape[1] + 1).double()
     return Trials(torch.arange(len(x)).double(), x, sample_times=times)
+
+
+def suggested(trials, x, times=None):
+    m = Measurements.of(trials, times)
+    return suggested_sampling(m, np.asarray(x).reshape(-1)[m.position])
 
 
 def smooth(num, length, width, rng):
@@ -28,7 +34,7 @@ def smooth(num, length, width, rng):
 @pytest.mark.parametrize("rho", [0.0, 0.5, 0.95])
 def test_errors_as_assumed_are_kept_all(rho):
     x = autocorrelated(np.random.default_rng(0).normal(size=(8, 300)), rho)
-    found = suggested_sampling(trials_of(x), x)
+    found = suggested(trials_of(x), x)
     assert found.every == 1
     assert abs(found.before) < 0.1
     assert found.suggested_step == pytest.approx(STEP)
@@ -38,12 +44,12 @@ def test_errors_as_assumed_are_kept_all(rho):
 @pytest.mark.parametrize("seed", [0, 1])
 def test_smooth_errors_are_thinned_to_about_their_width(width, seed):
     x = smooth(8, 500, width, np.random.default_rng(seed))
-    found = suggested_sampling(trials_of(x), x)
+    found = suggested(trials_of(x), x)
     assert 1.0 * width <= found.every <= 2.5 * width
     assert found.before > 0.9
     assert found.after <= 0.2
     # Their correlation is exp(-d^2 / (2 width^2)): as far apart, less than .61.
-    other = suggested_sampling(trials_of(x, step=1.0), x)
+    other = suggested(trials_of(x, step=1.0), x)
     assert other.every == found.every
     assert other.suggested_step == pytest.approx(found.every)
 
@@ -51,17 +57,17 @@ def test_smooth_errors_are_thinned_to_about_their_width(width, seed):
 def test_the_sensor_s_error_on_top_counts_by_its_size():
     rng = np.random.default_rng(0)
     x = 0.3 * smooth(8, 300, 6, rng) + rng.normal(size=(8, 300))
-    assert suggested_sampling(trials_of(x), x).every == 1
+    assert suggested(trials_of(x), x).every == 1
     x = smooth(8, 2_000, 40, rng) + 0.05 * rng.normal(size=(8, 2_000))
     # From sample to sample the smooth one moves by .025, half of the sensor's error.
-    assert 40 <= suggested_sampling(trials_of(x), x).every <= 100
+    assert 40 <= suggested(trials_of(x), x).every <= 100
 
 
 def test_at_least_eight_samples_are_left():
     x = np.sin(np.arange(40) / 30 + np.arange(6)[:, None])
-    assert suggested_sampling(trials_of(x), x).every <= 5
+    assert suggested(trials_of(x), x).every <= 5
     short = x[:, :7]
-    assert suggested_sampling(trials_of(short), short).every == 1
+    assert suggested(trials_of(short), short).every == 1
 
 
 def test_gaps_several_channels_and_ragged_trials():
@@ -71,9 +77,9 @@ def test_gaps_several_channels_and_ragged_trials():
     x[2, 100:120, 0] = np.nan
     times = STEP * (1 + np.arange(400)) + 0.002 * rng.random((6, 400))
     trials = Trials(torch.arange(6.0), x, sample_times=times)
-    assert 5 <= suggested_sampling(trials, x).every <= 13
+    assert 5 <= suggested(trials, x).every <= 13
     by_model = Trials(torch.arange(6.0), x)
-    assert suggested_sampling(by_model, x, times).every <= 13
+    assert suggested(by_model, x, times).every <= 13
 
 
 def sampling(every, step=1.0):
@@ -109,6 +115,6 @@ def test_a_slow_channel_beside_a_fast_one_does_not_hide_it():
     x = np.full((6, 600, 2), np.nan)
     x[:, :, 0] = smooth(6, 600, 10, rng)
     x[:, 3::50, 1] = rng.normal(size=(6, 12))
-    assert 8 <= suggested_sampling(trials_of(x), x).every <= 25
+    assert 8 <= suggested(trials_of(x), x).every <= 25
     x[:, 3::5, 1] = smooth(6, 600, 10, rng)[:, 3::5]
-    assert 4 <= suggested_sampling(trials_of(x), x).every <= 25
+    assert 4 <= suggested(trials_of(x), x).every <= 25
