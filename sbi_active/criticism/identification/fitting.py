@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from itertools import compress
 
@@ -45,25 +45,32 @@ class Linear:
     """A simulator with effects that may be there, linear near its best fit.
 
     Attributes:
-        rival: Rival of theta and the effects beside it.
-        effect: Number of the effect that a coordinate belongs to, -1 for none, (d,).
-        null: Values at which effects vanish, shape (d,); NaN for other coordinates.
+        rival: Rival of theta and all effects beside it.
+        effects: Effects that may be there.
+        effect: Number of the effect that a coordinate belongs to, -1 for none, and one
+            beyond all for those that are left out, shape (d,).
+        origin: Point of linearization, with effects at their null, shape (d,).
         unit: Root mean square residual of each number's channel, shape (N,).
-        fit: Linear model, in units, where it was fitted.
+        model: Linear model, in units, whose coordinates count from the origin.
+        aliases: Names of effects that are left out since parameters do the same.
     """
 
     rival: Rival
+    effects: Sequence[Effect]
     effect: NDArray[np.int64]
-    null: Array
+    origin: Array
     unit: Array
-    fit: LinearModel
+    model: LinearModel
+    aliases: tuple[str, ...]
 
     def around(
         self,
         fit: LinearModel,
         free: NDArray[np.bool_],
         unit: Array,
-        tried: float | None = None,
+        tried: float,
+        *,
+        flat: float = 100.0,
     ) -> Linear:
         """Return the linear model around a fit of some of the effects.
 
@@ -71,51 +78,29 @@ class Linear:
             fit: Linear model in units, without the others.
             free: Coordinates of that model, shape (d,).
             unit: Units of the residuals, shape (N,).
-            tried: Deviations of the prior by which the others are tried anew: by a
-                chord, since many are flat at their null.
-        """
-        at = np.array(self.null)
-        at[free] = fit.u
-        if tried is None:
-            columns = self.fit.jacobian[:, ~free]
-        else:
-            columns = chords(self.rival, at, ~free, tried, fit, unit)
-        full = enlarged(fit, self.rival, ~free, at[~free], columns)
-        return replace(self, unit=unit, fit=full)
-
-    def without(self, kept: NDArray[np.bool_]) -> Linear:
-        """Return the linear model without some of its effects.
-
-        Args:
-            kept: Mask of those that it keeps, shape (e,).
-        """
-        at = np.append(kept, True)[self.effect]
-        number = np.append(np.cumsum(kept) - 1, -1)
-        return replace(
-            self,
-            rival=with_effects(self.rival, [*compress(self.rival.effects, kept)]),
-            effect=number[self.effect[at]],
-            null=self.null[at],
-            fit=self.fit.part(at),
-        )
-
-    @property
-    def origin(self) -> Array:
-        """Point of linearization, with effects at their null, shape (d,)."""
-        return np.where(self.effect < 0, self.fit.u, self.null)
-
-    def model(self, *, flat: float = 100.0) -> LinearModel:
-        """Return the linear model at the origin, from which coordinates count.
-
-        Args:
+            tried: Deviations of the prior by which the others are tried: by a chord,
+                since many are flat at their null.
             flat: Deviation of the Gaussian that stands for a flat prior, in units of
                 its range: it leaves the prior as it is, and directions that nothing
                 tells solvable.
         """
-        fit, origin = self.fit, self.origin
-        model = replace(fit, u=origin, residual=fit.at(origin[None])[0]).from_here()
-        is_flat = (self.effect < 0) & (self.rival.coordinates.precision == 0)
-        return replace(model, sd=np.where(is_flat, flat * (fit.high - fit.low), fit.sd))
+        c, is_own, at = self.rival.coordinates, self.effect < 0, self.origin.copy()
+        at[free] = fit.u
+        columns = chords(self.rival, at, ~free, tried, fit, unit)
+        full = enlarged(fit, self.rival, ~free, at[~free], columns)
+        origin = np.where(is_own, at, self.origin)
+        is_flat = is_own & (c.precision == 0)
+        sd = np.where(is_flat, flat * (c.high - c.low), full.sd)
+        model = replace(full, u=origin, residual=full.at(origin[None])[0], sd=sd)
+        return replace(self, origin=origin, unit=unit, model=model.from_here())
+
+    def free(self, present: Iterable[int]) -> NDArray[np.bool_]:
+        """Return the coordinates that are not zero, (d,), by the effects present."""
+        return np.isin(self.effect, [-1, *present])
+
+    def only(self, present: NDArray[np.bool_]) -> Rival:
+        """Return the rival of theta and some of the effects, mask of shape (e,)."""
+        return with_effects(self.rival, [*compress(self.effects, present)])
 
     @property
     def sizes(self) -> Array:
@@ -135,12 +120,10 @@ class Fitted(Linear):
     Attributes:
         errors: Errors of each channel.
         draws: Draws of u - ``origin``.
-        aliases: Effects that are left out since parameters do the same.
     """
 
     errors: ChannelErrors
     draws: Draws
-    aliases: tuple[str, ...]
 
     def whitened(self, rows: Array, fold: NDArray[np.int64]) -> Array:
         """Return rows (N, k) whitened by the likeliest error of each channel.
@@ -161,13 +144,14 @@ class Fitted(Linear):
             u: Mean of the posterior, shape (d,).
             free: Coordinates that may move, shape (d,).
         """
-        c, fit = self.rival.coordinates, self.fit
-        bent = self.rival.residual(u[None])[0][0] / self.unit - fit.at(u[None])[0]
-        rows = np.concatenate([bent[:, None], fit.rows[:, 1:][:, free]], 1)
+        model, at = self.model, (u - self.origin)[None]
+        bent = self.rival.residual(u[None])[0][0] / self.unit - model.at(at)[0]
+        rows = np.concatenate([bent[:, None], model.rows[:, 1:][:, free]], 1)
         white = self.whitened(rows, 0 * self.measurements.trial)
-        slope, precision = white[:, 1:], np.diag(self.model().sd[free] ** -2)
+        slope, precision = white[:, 1:], np.diag(model.sd[free] ** -2)
         step = np.linalg.solve(slope.T @ slope + precision, slope.T @ white[:, 0])
-        move = np.clip(u[free] + step, c.low[free], c.high[free]) - u[free]
+        ends = (model.low[free], model.high[free])
+        move = np.clip(at[0, free] + step, *ends) - at[0, free]
         return np.abs(move) / (self.draws.u.std(0)[free] + self.rival.step)
 
 
@@ -196,31 +180,31 @@ def fitted(
     bare = _bare(model, prior, trials, beside, own, seed)
     fit, unit = _searched(bare, own, seed)
     doubtful = [e for e in beside if e.scope == "campaign"]
-    linear, aliases = _beside(with_effects(bare, doubtful), fit, unit, own)
+    linear = _beside(with_effects(bare, doubtful), fit, unit, own)
     m, c = linear.measurements, linear.rival.coordinates
     share = 1.0 if known_sd is None else ((known_sd[m.channel] / unit) ** 2).min()
     filters = Filters(own.errors(m, float(share)), m, 0 * m.trial, m.channel)
-    there, again = np.zeros(len(linear.rival.effects), dtype=bool), own.linearized
+    there, again = np.zeros(len(linear.effects), dtype=bool), own.linearized
     while True:
         errors = ChannelErrors(
             processes=filters.processes,
-            grams=filters.grams(linear.model().rows),
+            grams=filters.grams(linear.model.rows),
             known=None if known_sd is None else known_sd / linear.sizes,
         )
         draws = _posterior(linear, errors, own, rng).draws(own.num_draws, rng)
-        found = Fitted(**vars(linear), errors=errors, draws=draws, aliases=aliases)
+        found = Fitted(**vars(linear), errors=errors, draws=draws)
         before, there = there, draws.present.mean(0) > own.likely
-        free, is_new = np.append(there, True)[linear.effect], (there != before).any()
+        free, is_new = linear.free(there.nonzero()[0]), (there != before).any()
         u = linear.origin + np.where(free, draws.u.mean(0), 0.0)
         u, again = np.clip(u, c.low, c.high), again - 1
         if not again or not (is_new or found.off(u, free).max() > own.moved):
             return found
-        some = with_effects(bare, [*compress(linear.rival.effects, there)])
+        some = linear.only(there)
         if is_new:
             fit, unit = _settled(some, u[free], own)
         else:
             fit = centered(some, linearize(some, u[free], unit), unit)
-        linear = linear.around(fit, free, unit, own.tried if is_new else None)
+        linear = linear.around(fit, free, unit, own.tried)
 
 
 def _posterior(
@@ -240,8 +224,8 @@ def _posterior(
         settings: Settings of what is spent.
         rng: Source of the draws.
     """
-    own, model, effects = settings, linear.model(), linear.rival.effects
-    every = linear.effect < 0, np.ones(len(linear.effect), dtype=bool)
+    own, model, effects = settings, linear.model, linear.effects
+    every = linear.free(()), linear.free(range(len(effects)))
     places = [errors.places(model, free, own.num_places, rng) for free in every]
 
     def given() -> Posterior:
@@ -335,10 +319,10 @@ def _sizes(rival: Rival, residual: Array, settings: IdentifySettings) -> Array:
 
 def _beside(
     whole: Rival, bare: LinearModel, unit: Array, settings: IdentifySettings
-) -> tuple[Linear, tuple[str, ...]]:
-    """Return a model with effects that are absent so far, and what parameters imitate.
+) -> Linear:
+    """Return a model with effects that are absent so far.
 
-    Those and what changes nothing are left out.
+    What changes nothing, or what parameters imitate, is left out.
 
     Args:
         whole: Rival with all effects.
@@ -346,18 +330,24 @@ def _beside(
         unit: Units of the residuals, shape (N,).
         settings: Settings of what is told apart.
     """
-    own, effect, null = settings, np.full(whole.dim, -1), np.full(whole.dim, np.nan)
-    for k, e in enumerate(whole.effects):
-        effect[whole.coordinates.places[e.name]] = k
-        null[effect == k] = at_null(whole, e, own.tried)[0]
-    found = Linear(whole, effect, null, unit, bare)
-    found = found.around(bare, effect < 0, unit, own.tried)
-    jacobian, basis = found.fit.jacobian, basis_of(bare.jacobian)
+    own, effects, u = settings, whole.effects, np.zeros(whole.dim)
+    number, places = np.full(whole.dim, -1), whole.coordinates.places
+    for k, e in enumerate(effects):
+        number[places[e.name]] = k
+        u[places[e.name]] = at_null(whole, e, own.tried)[0]
+    linear = Linear(whole, effects, number, u, unit, bare, ())
+    linear = linear.around(bare, number < 0, unit, own.tried)
+    jacobian, basis = linear.model.jacobian, basis_of(bare.jacobian)
     left = jacobian - basis @ (basis.T @ jacobian)
     apart, size = (
-        np.sqrt(np.bincount(effect + 1, (part**2).sum(0), len(whole.effects) + 1))[1:]
+        np.sqrt(np.bincount(number + 1, (part**2).sum(0), len(effects) + 1))[1:]
         for part in (left, jacobian)
     )
     told = apart > own.alias * size
-    aliases = compress(whole.effects, ~told & (size > 0))
-    return found.without(told), tuple(e.name for e in aliases)
+    renumbered = np.where(told, np.cumsum(told) - 1, told.sum())
+    return replace(
+        linear,
+        effects=[*compress(effects, told)],
+        effect=np.append(renumbered, -1)[number],
+        aliases=tuple(e.name for e in compress(effects, ~told & (size > 0))),
+    )

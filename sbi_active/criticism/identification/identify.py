@@ -185,7 +185,7 @@ def identify(
         .extended(
             num_simulations=found.rival.simulator.num_simulations,
             effective_sample_size=effective,
-            beside=dict(zip(found.rival.key.effects, present, strict=True)),
+            beside=dict(zip([e.name for e in found.effects], present, strict=True)),
             aliases=found.aliases,
             errors=errors,
             disagreement=dict(zip(names, parts.p_value.tolist(), strict=True)),
@@ -244,7 +244,7 @@ def _sampled(
     fit, u = sampled(found, sets[best], rng, own.most_simulated), draws.u.copy()
     # Few draws would make for a narrow interval: rather that of the linear model.
     if fit.effective_sample_size >= own.fewest:
-        free = np.append(sets[best], True)[found.effect]
+        free = found.free(sets[best].nonzero()[0])
         u[np.ix_(at, free)] = fit.draws(len(at), rng) - found.origin[free]
     return u, fit.effective_sample_size, fit.tail_shape
 

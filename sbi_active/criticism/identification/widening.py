@@ -7,15 +7,14 @@ and beside bounds of the prior.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from itertools import compress
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2, norm, rankdata
 
 from sbi_active.arrays import Array
-from sbi_active.criticism.identification.fitting import Fitted, with_effects
+from sbi_active.criticism.identification.fitting import Fitted
 from sbi_active.criticism.linear.processes import parts_of
 from sbi_active.criticism.rivals.fit import NESTED
 from sbi_active.inference.engine import Fit, infer, search
@@ -62,7 +61,7 @@ def bends(linear: Fitted, at: NDArray[np.int64], most: float) -> bool:
         at: Places of the draws that are looked at, shape (k,).
         most: Deviation of the log density ratio up to which it is not, nats.
     """
-    error, model, c = SettledError(linear), linear.model(), linear.rival.coordinates
+    error, model, c = SettledError(linear), linear.model, linear.rival.coordinates
     u = linear.draws.u[at]
     left = linear.rival.residual(linear.origin + u)[0], linear.unit * model.at(u)
     log_p, log_q = error.log_likelihood(np.stack(left))
@@ -83,10 +82,8 @@ def sampled(
         rng: Source of the draws.
         most: Simulations of all trials to spend.
     """
-    free = np.append(present, True)[linear.effect]
-    rival = with_effects(linear.rival, [*compress(linear.rival.effects, present)])
-    error: Any = SettledError(linear)
-    rival = replace(rival, error=error)
+    free, error = linear.free(present.nonzero()[0]), SettledError(linear)
+    rival = replace(linear.only(present), error=cast(Any, error))
     u, c = linear.origin + linear.draws.u.mean(0), linear.rival.coordinates
     near = np.clip(u, c.low, c.high)[free]
     found = search(rival, rng, near[None], NESTED)
@@ -125,10 +122,10 @@ def spread(found: Fitted, fewest: int) -> Spread:
         fewest: Number of parts at least.
     """
     draws, m, own = found.draws, found.measurements, found.rival.theta_dim
-    likely = np.append(draws.present.mean(0) > 0.5, True)
-    free = (found.rival.coordinates.trial_of() < 0) & likely[found.effect]
+    likely = (draws.present.mean(0) > 0.5).nonzero()[0]
+    free = (found.model.trial_of < 0) & found.free(likely)
     parts = parts_of(m, fewest, fewest)
-    white = found.whitened(found.model().rows[:, np.append(True, free)], parts)
+    white = found.whitened(found.model.rows[:, np.append(True, free)], parts)
     each = [white[parts == f] for f in range(int(parts.max()) + 1)]
     grams = np.stack([rows.T @ rows for rows in each])
     precision, linear = grams[:, 1:, 1:], grams[:, 1:, 0]
