@@ -29,7 +29,7 @@ import torch
 from sbi_active.arrays import Array
 from sbi_active.criticism.data.measurements import Measurements
 from sbi_active.criticism.data.trials import Trials
-from sbi_active.criticism.linear.fits import JUMPING, FitSettings, best_fit, sensor_of
+from sbi_active.criticism.linear.fits import JUMPING, FitSettings, best_fit
 from sbi_active.criticism.linear.library import Library
 from sbi_active.criticism.linear.model import LinearModel
 from sbi_active.criticism.linear.processes import series_of
@@ -232,14 +232,14 @@ def linear_models(rivals: RivalSet) -> tuple[Search, Screening | None]:
     if rivals.noise.is_by_channel:
         own = rivals.rival(ModelKey()), rivals.prior_draws, rivals.noise.typical_sd
         rivals = _sized(rivals, own[2], [best_fit(*own, settings)])
-    search = Search(rivals, sensor_of(rivals), settings)
+    search = Search(rivals, settings)
     if rivals.noise.is_by_channel:
         # What is missing may be seen in one channel alone, and no error of it.
         search.fit_singles()
         models, m = [c.model for c in search.found.values()], rivals.measurements
         best = min(models, key=lambda model: _log_sizes(model.residual, m))
         rivals = _sized(rivals, search.unit, [search.model(ModelKey()), best])
-        search = Search(rivals, sensor_of(rivals), settings)
+        search = Search(rivals, settings)
     if len(rivals.effects) <= MANY:
         return search, None
     best = _scores(search.library)
@@ -297,9 +297,9 @@ def thinned_to_need(rivals: RivalSet, trials: Trials) -> tuple[Trials, Sampling 
         return trials, None
     if measurement_sds(rivals.model.noise, m) is None:
         return trials, None
-    sensor = sensor_of(rivals)
-    bare = Search(rivals, sensor).model(ModelKey())
-    sampling = suggested_sampling(m, sensor.unit * bare.residual)
+    search = Search(rivals)
+    left = search.unit * search.model(ModelKey()).residual
+    sampling = suggested_sampling(m, left)
     if sampling.every == 1:
         return trials, sampling
     times = None if model_times is None else model_times.double().numpy()

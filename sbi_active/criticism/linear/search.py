@@ -20,7 +20,6 @@ from sbi_active.criticism.forces.library import is_force
 from sbi_active.criticism.linear.errors import Errors
 from sbi_active.criticism.linear.fits import (
     FitSettings,
-    Sensor,
     along_secants,
     best_fit,
     onward,
@@ -49,10 +48,11 @@ class Search:
 
     Args:
         rivals: The models and the trials; smooth.
-        sensor: The sensor's error.
         settings: Settings of what is spent on fits.
 
     Attributes:
+        sensor: The sensor's error.
+        unit: A standard deviation of each number by it, shape (N,).
         found: Fitted models, the bare one first.
         errors: Errors that all models share; known after the bare fit.
         prior: Log prior probabilities of "none" and each effect of the library.
@@ -60,7 +60,6 @@ class Search:
     """
 
     rivals: RivalSet
-    sensor: Sensor
     settings: FitSettings = FitSettings()
     found: dict[ModelKey, Candidate] = field(default_factory=dict)
 
@@ -68,9 +67,10 @@ class Search:
         self.prior = log_priors(self.rivals.library)
         self._rivals: dict[ModelKey, Rival] = {}
         self._reference: Array | None = None
-        self.units = self.sensor.unit
+        self.sensor = self.rivals.sensor
+        self.unit = self.units = self.sensor.typical_sd
         if self.rivals.simulator.is_stochastic:
-            self._reference = self.sensor.unit
+            self._reference = self.unit
             self.units = np.ones(2 * len(self.units))
         self._library: Library | None = None
         self._processes: dict[bytes, ResidualProcess] = {}
@@ -80,8 +80,8 @@ class Search:
         bare = best_fit(*own, self.settings)
         self.errors = Errors(
             self.rivals.measurements,
-            self.sensor.unit,
-            self.sensor.noise,
+            self.unit,
+            self.sensor,
             largest=bare.rms,
             warm_up=self.rivals.warm_up if self.rivals.nuisances else 0.0,
             varying=bare.jacobian[: bare.num, bare.trial_of < 0],
@@ -92,11 +92,6 @@ class Search:
     def names(self) -> list[str]:
         """Effects that change the prediction, of which sets are fitted."""
         return [e.name for e in self.rivals.effects.values() if e.hook != "noise"]
-
-    @property
-    def unit(self) -> Array:
-        """Standard deviation of the sensor, shape (N,)."""
-        return self.sensor.unit
 
     @property
     def library(self) -> Library:
@@ -185,7 +180,7 @@ class Search:
         """
         own = use[self.errors.fold]
         if (key := own.tobytes()) not in self._processes:
-            process = self.rivals.residual_process(self.sensor.noise, own)
+            process = self.rivals.residual_process(self.sensor, own)
             self._processes[key] = process
         rows, unit = model.rows, self.unit[own]
         own_rows = unit[:, None] * rows[: model.num][own]
@@ -197,7 +192,7 @@ class Search:
     def explains(self) -> bool:
         """Whether a model leaves no more than the sensor's error."""
         least = self.settings.passes
-        if not self.sensor.is_known:
+        if not self.sensor.has_size:
             return False
         return any(c.model.chi_square[2] >= least for c in self.found.values())
 

@@ -123,7 +123,7 @@ class States:
         some = np.ones(errors.num_folds, bool) if use is None else use
         gram, log_p = errors.hypotheses(c.model, c.grams, some, key.error)
         timed = self.search.rivals.measurements.is_sequence
-        is_declared = timed and self.search.sensor.is_known
+        is_declared = timed and self.search.sensor.has_size
         if key.error == UNEXPLAINED and not is_declared:
             # Errors of their own are scatter; what differs by trial is not.
             own = slice(errors.num_processes, None)

@@ -224,7 +224,7 @@ def beyond_bounds(found: Verdict, rivals: RivalSet, tracing: Tracing) -> Tracing
         bounds = replace(bounds, parameters=(*bounds.parameters, *held))
         if key != ModelKey() or again is None or not held:
             continue
-        if found.search.sensor.is_known:
+        if found.search.sensor.has_size:
             rest = rival.residual(again[0][None])[0][0] / found.search.unit
             freedom = max(len(rest) - rival.dim, 1)
             p_value = float(chi2.sf(found.states.square(rest), freedom))

@@ -103,7 +103,7 @@ def bends(search: Search, key: ModelKey) -> bool:
         search: Search that has fitted the model.
         key: Key of the model.
     """
-    rivals, sensor = search.rivals, search.sensor
+    rivals = search.rivals
     if not rivals.is_smooth:
         return False  # its jumps leave any model, and count as noise
     c = search.found[key]
@@ -115,8 +115,7 @@ def bends(search: Search, key: ModelKey) -> bool:
     if fails or rivals.simulator.is_stochastic:
         ratio = rival.log_likelihood(u) + 0.5 * (linear**2).sum(1)
     else:
-        noise = rivals.noise if np.isfinite(sensor.df) else sensor.noise
-        log_p, unit = noise.log_likelihood, search.unit * m.scale
+        log_p, unit = search.sensor.log_likelihood, search.unit * m.scale
         ratio = log_p(rival.residual(u)[0]) - log_p(unit * linear)
     return not ratio.std() < 0.5  # NaN: not simulated
 

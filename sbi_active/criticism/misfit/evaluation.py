@@ -10,7 +10,6 @@ import pandas as pd
 
 from sbi_active.arrays import Array
 from sbi_active.criticism.data.trials import Trials
-from sbi_active.criticism.linear.fits import sensor_of
 from sbi_active.criticism.misfit.draws import posterior
 from sbi_active.criticism.misfit.verdict import Verdict
 from sbi_active.criticism.results import (
@@ -57,7 +56,7 @@ def evaluate_held_out(
     found = summary("held out", np.arange(num), *scored, selected, held_out.names)
     sensor = None
     if rivals.model.noise is not None:
-        square = rivals.measurements.by_channel(sensor_of(rivals).unit ** 2)
+        square = rivals.measurements.by_channel(rivals.sensor.typical_sd**2)
         sensor = np.sqrt(square)
     own = tracing, held_out, before, after
     missed = missed_trials(*own, sensor=sensor, level=level)

@@ -211,7 +211,7 @@ class Verdict:
         scatters = own.error == SCATTER and bool(own.effects)
         several = len(self.choice.key.effects) > 1
         is_missed = scatters or several or own.error == UNEXPLAINED
-        return self.search.sensor.is_known and is_missed
+        return self.search.sensor.has_size and is_missed
 
     @cached_property
     def probabilities(self) -> dict[ModelKey, float]:
@@ -257,7 +257,7 @@ class Verdict:
     def p_value(self) -> float:
         """Tail of the verdict's chi-square; NaN where the error has no size."""
         key = ModelKey(self.key.effects)
-        if not self.search.sensor.is_known:
+        if not self.search.sensor.has_size:
             return float("nan")
         return self.states.chi_square(key)[1]
 
@@ -289,7 +289,7 @@ class Verdict:
     def misses(self, key: ModelKey) -> bool:
         """Return whether a model misses the trials by more than the sensor's error."""
         misses = self.beside(key).error in (SCATTER, UNEXPLAINED)
-        return self.is_missed or (self.search.sensor.is_known and misses)
+        return self.is_missed or (self.search.sensor.has_size and misses)
 
     def shown(self, key: ModelKey) -> Array:
         r"""Return the covariance that intervals of a model's coordinates have, (d, d).

@@ -127,6 +127,17 @@ class NoiseGrid:
         """Whether nothing of it is unknown, so that one transform whitens all."""
         return len(self.cells) == len(self.scales) == 1
 
+    @cached_property
+    def has_size(self) -> bool:
+        """Whether its size is declared, and its correlation at most unknown."""
+        first = self.cells[0].sd
+        return len(self.scales) == 1 and all((c.sd == first).all() for c in self.cells)
+
+    @property
+    def df(self) -> float:
+        """Degrees of freedom of t errors; inf for Gaussian ones."""
+        return float(np.median([cell.df for cell in self.cells]))
+
     @property
     def typical_sd(self) -> Array:
         """Geometric mean over the cells, shape (N,)."""

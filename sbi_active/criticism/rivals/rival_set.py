@@ -22,8 +22,10 @@ from sbi_active.criticism.results import SCATTER, UNEXPLAINED, Evidence, ModelKe
 from sbi_active.criticism.rivals.coordinates import SearchCoordinates
 from sbi_active.criticism.rivals.error_models import (
     LARGEST,
+    NoiseCell,
     NoiseGrid,
     declared_noise,
+    measurement_sds,
     sizes,
 )
 from sbi_active.criticism.rivals.fit import (
@@ -167,6 +169,22 @@ class RivalSet:
             step=self.step,
             **further,
         )
+
+    @property
+    def sensor(self) -> NoiseGrid:
+        """The sensor's error.
+
+        What a simulator that jumps strays from any smooth function is part of it,
+        unless ``measurement_sd`` says what it is. A random simulator has a deviation of
+        its own.
+        """
+        m = self.measurements
+        if (measured := measurement_sds(self.model.noise, m)) is not None:
+            sd = np.broadcast_to(measured, len(m)).astype(float)
+            return NoiseGrid([NoiseCell.of(m, sd=sd)])
+        if self.model.noise is None:
+            return self.noise.sized([self.typical_deviation()])
+        return self.noise
 
     def _error_model(
         self, error: str | None, suspect: int | None

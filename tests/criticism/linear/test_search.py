@@ -7,7 +7,7 @@ from torch.distributions import Independent, Uniform
 
 from sbi_active import GaussianNoise, SimulatorModel
 from sbi_active.criticism import Criticism, Trials
-from sbi_active.criticism.linear.fits import FitSettings, sensor_of
+from sbi_active.criticism.linear.fits import FitSettings
 from sbi_active.criticism.linear.search import Search
 from sbi_active.criticism.results import ModelKey
 from tests.effects import on_outcomes
@@ -41,7 +41,7 @@ def searched(**settings):
     model = SimulatorModel(curve, noise=GaussianNoise(SENSOR))
     prior = BoxUniform(-5 * torch.ones(2), 5 * torch.ones(2))
     loop = Criticism(model, prior, Trials(action, x), effects=EFFECTS, seed=0)
-    search = Search(loop.rivals, sensor_of(loop.rivals), FitSettings(**settings))
+    search = Search(loop.rivals, FitSettings(**settings))
     search.fit_singles()
     return search
 
