@@ -39,9 +39,7 @@ def with_noise(
     fewest_repeats: int = 3,
 ) -> SimulatorModel:
     """Return the model with noise from repeats where it is deterministic without."""
-    theta, action, at = _some_rows(prior, trials)
-    run = conditions_for(model, trials, at, theta.dtype)
-    if model.noise is not None or not model.is_deterministic(theta, action, **run):
+    if not lacks_noise(model, prior, trials):
         return model
     fit = trials.fit
     first = torch.where(fit.repeat_of < 0, torch.arange(len(fit)), fit.repeat_of)
@@ -63,6 +61,13 @@ def with_noise(
         pooled=True,
     )
     return noisy
+
+
+def lacks_noise(model: SimulatorModel, prior: Distribution, trials: Trials) -> bool:
+    """Return whether a simulator is deterministic, and no noise is declared."""
+    theta, action, at = _some_rows(prior, trials)
+    run = conditions_for(model, trials, at, theta.dtype)
+    return model.noise is None and model.is_deterministic(theta, action, **run)
 
 
 def digest(

@@ -10,10 +10,9 @@ import torch
 from torch.distributions import Distribution
 
 from sbi_active.arrays import Array
-from sbi_active.criticism.checks import require_fitting
+from sbi_active.criticism.checks import lacks_noise, require_fitting
 from sbi_active.criticism.data.trials import Trials
 from sbi_active.criticism.effects.effect import Effect
-from sbi_active.criticism.effects.trial_conditions import conditions_for
 from sbi_active.criticism.identification.fitting import Fitted, fitted
 from sbi_active.criticism.identification.settings import IdentifySettings
 from sbi_active.criticism.identification.widening import (
@@ -27,7 +26,7 @@ from sbi_active.expected import suggests
 from sbi_active.inference.beliefs.diagnostics import Diagnostics
 from sbi_active.inference.beliefs.weighted import KernelBelief
 from sbi_active.inference.sampling.weights import scott
-from sbi_active.seeding import derive_seed, forked_generators
+from sbi_active.seeding import derive_seed
 from sbi_active.simulation import GaussianNoise, SimulatorModel
 from sbi_active.threads import single_thread
 
@@ -202,11 +201,7 @@ def _with_noise(
     noise = model.noise
     num = int(np.prod(trials.x.shape[2:]))
     if noise is None:
-        with forked_generators(0, "random"):
-            theta = prior.sample(torch.Size([len(trials)]))
-        run = conditions_for(model, trials, torch.arange(len(trials)), theta.dtype)
-        action = trials.action.to(theta.dtype)
-        if not model.is_deterministic(theta, action, **run):
+        if not lacks_noise(model, prior, trials):
             raise ValueError(
                 "expected a deterministic simulator; got a random one; use Campaign, "
                 "which learns what it returns, or fix its seed and declare noise="

@@ -97,19 +97,13 @@ class LinearModel:
         bounded = np.isfinite(self.low) & np.isfinite(self.high)
         weight = np.where(bounded, 0.0, 1.0) / self.sd**2
         normal = self.jacobian.T @ self.jacobian / scale + np.diag(weight)
-        normal = normal + np.diag(RIDGE * (1 + np.diag(normal)))
         off = (self.u - self.center) * weight
         gradient = self.jacobian.T @ self.residual / scale + off
+        system = normal + np.diag(RIDGE * (1 + np.diag(normal)))
         at = self.u[None]
-        step = within(normal[None], gradient[None], at, self.low, self.high)
+        step = within(system[None], gradient[None], at, self.low, self.high)
         move = np.clip(self.u - step[0], self.low, self.high) - self.u
-
-        def cost(r: Array, u: Array) -> float:
-            prior = (weight * (u - self.center) ** 2).sum()
-            return float((r**2).sum() / scale + prior)
-
-        after = cost(self.residual + self.jacobian @ move, self.u + move)
-        return (cost(self.residual, self.u) - after) * scale
+        return float(-(2 * gradient + normal @ move) @ move) * scale
 
     def part(self, at: NDArray[Any]) -> LinearModel:
         """Return the model of some of its coordinates, the others held where it is."""

@@ -270,25 +270,17 @@ class States:
             key: Effects of the model.
         """
         model = self.search.model(self.predicting(key))
-        _, freedom, p = model.chi_square
-        square = self.square(model.residual[: model.num])
-        if is_louder := bool(self.louder(key)):
-            residual = model.residual[: model.num] / self.louder_draws(key)[1]
-            square = float((self._innovations(residual) ** 2).sum(1).min())
-        if is_louder or self._is_correlated:
-            p = float(chi2.sf(square, freedom))
-        return square, p
+        residual = model.residual[: model.num]
+        if self.louder(key):
+            residual = residual / self.louder_draws(key)[1]
+        square = float(np.min(self.square(residual)))
+        return square, float(chi2.sf(square, model.chi_square[1]))
 
-    def square(self, residual: Array) -> float:
-        """Return the sum of the squares of residuals (N,) in sensor deviations."""
-        return float((self._innovations(residual) ** 2).sum())
+    def square(self, residual: Array) -> Array:
+        """Return sums of squares, (...,), of residuals (..., N) in sensor deviations.
 
-    @property
-    def _is_correlated(self) -> bool:
+        They are those of the innovations where a correlation is declared.
+        """
         cells = self.search.errors.cells
-        return len(cells) == 1 and bool(cells[0].rho.any())
-
-    def _innovations(self, residual: Array) -> Array:
-        """Return residuals (..., N) without a correlation that is declared."""
-        cell = self.search.errors.cells[0]
-        return cell.whiten(residual) if self._is_correlated else residual
+        innovations = cells[0].whiten(residual) if len(cells) == 1 else residual
+        return (innovations**2).sum(-1)
