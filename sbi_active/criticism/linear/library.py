@@ -10,8 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sbi_active.criticism.linear.errors import Errors
-from sbi_active.criticism.linear.mixture import Mixture, either
+from sbi_active.criticism.linear.mixture import either
 from sbi_active.criticism.linear.model import LinearModel
+from sbi_active.criticism.linear.processes import Grams
 from sbi_active.criticism.results import ModelKey
 from sbi_active.criticism.steps.detection import log_prior
 
@@ -46,13 +47,6 @@ class Library:
         ends = np.cumsum([len(fitted.u), *[len(part.u) for part in parts]])
         each = zip(self.names, ends[:-1], ends[1:], strict=True)
         self._places = {name: np.arange(first, last) for name, first, last in each}
-        self._prepared, self._grams = self._own[:0], None
-        self._found: dict[tuple[str, ...], list[Mixture]] = {}
-
-    def prepare(self, names: Sequence[str]) -> None:
-        """Compute once what all pairs of some effects take, in the library's order."""
-        self._prepared = self._at(names)
-        self._grams = self.errors.grams(self._every.part(self._prepared).rows)
 
     def scores(
         self, names: Sequence[str], num: int, *, most: int = 12
@@ -68,28 +62,28 @@ class Library:
         found = {}
         for start in range(0, len(names), size):
             some = names[start : start + size]
-            self.prepare(some)
-            found |= {new: self.score(new) for new in combinations(some, num)}
+            known = self._at(some)
+            grams = self.errors.grams(self._every.part(known).rows)
+            for new in combinations(some, num):
+                found[new] = self._score(new, known, grams)
         return found
-
-    def score(self, names: tuple[str, ...]) -> float:
-        """Return the log posterior probability of a set, unnormalized."""
-        every = (*self.base.effects, *names)
-        return either(*self._posterior(names)) + log_prior(every, self.prior)
 
     def _at(self, names: Sequence[str]) -> NDArray[np.intp]:
         return np.concatenate([self._own, *[self._places[name] for name in names]])
 
-    def _posterior(self, names: tuple[str, ...]) -> list[Mixture]:
-        if names not in self._found:
-            at, grams = self._at(names), self._grams
-            model = self._every.part(at)
-            if grams is None or not np.isin(at, self._prepared).all():
-                grams = self.errors.grams(model.rows)
-            else:
-                rows = np.append(0, 1 + np.searchsorted(self._prepared, at))
-                grams = replace(grams, gram=grams.gram[..., rows[:, None], rows])
-            self._found[names] = [
-                self.errors.mixture(model, grams, beside=b) for b in (False, True)
-            ]
-        return self._found[names]
+    def _score(
+        self, names: tuple[str, ...], known: NDArray[np.intp], grams: Grams
+    ) -> float:
+        """Return the log posterior probability of a set, unnormalized.
+
+        Args:
+            names: Further effects of the set.
+            known: Coordinates of the Gram matrices, ascending.
+            grams: Gram matrices with, among others, all rows of the set.
+        """
+        at = self._at(names)
+        rows = np.append(0, 1 + np.searchsorted(known, at))
+        own = replace(grams, gram=grams.gram[..., rows[:, None], rows])
+        given, mixture = (self._every.part(at), own), self.errors.mixture
+        both = (mixture(*given, beside=beside) for beside in (False, True))
+        return either(*both) + log_prior((*self.base.effects, *names), self.prior)

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -66,13 +67,10 @@ class Search:
     def __post_init__(self) -> None:
         self.prior = log_priors(self.rivals.library)
         self._rivals: dict[ModelKey, Rival] = {}
-        self._reference: Array | None = None
         self.sensor = self.rivals.sensor
         self.unit = self.units = self.sensor.typical_sd
         if self.rivals.simulator.is_stochastic:
-            self._reference = self.unit
-            self.units = np.ones(2 * len(self.units))
-        self._library: Library | None = None
+            self.units = np.ones(2 * len(self.unit))
         self._processes: dict[bytes, ResidualProcess] = {}
         self._has_larger = False
         self._seed = derive_seed(self.rivals.seed, "misfit")
@@ -93,12 +91,10 @@ class Search:
         """Effects that change the prediction, of which sets are fitted."""
         return [e.name for e in self.rivals.effects.values() if e.hook != "noise"]
 
-    @property
+    @cached_property
     def library(self) -> Library:
         """The bare model with the columns of all effects."""
-        if self._library is None:
-            self._library = self._library_of(ModelKey(), self.names)
-        return self._library
+        return self._library_of(ModelKey(), self.names)
 
     def model(self, key: ModelKey) -> LinearModel:
         """Return a fitted model."""
@@ -268,7 +264,9 @@ class Search:
     def rival(self, key: ModelKey) -> Rival:
         """Return a model that may be fitted."""
         if key not in self._rivals:
-            given = {"reference": self._reference, "df": self.sensor.df}
+            is_random = self.rivals.simulator.is_stochastic
+            reference = self.unit if is_random else None
+            given = {"reference": reference, "df": self.sensor.df}
             self._rivals[key] = self.rivals.rival(key, **given)
         return self._rivals[key]
 

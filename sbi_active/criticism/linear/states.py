@@ -233,8 +233,7 @@ class States:
         own = ModelKey(key.effects, OUTLIER)
         if own not in self.keys(key):
             return {}
-        rivals = self.search.rivals
-        trials = rivals.trials.index.numpy()[np.unique(rivals.measurements.trial)]
+        trials = self._measured
         share = self.mixture(own).share.reshape(len(trials), -1).sum(1)
         order = np.argsort(-share, kind="stable")
         return {float(trials[k]): float(share[k]) for k in order}
@@ -255,9 +254,13 @@ class States:
             self.mixture(key, ~own).log_evidence - self.mixture(bare, ~own).log_evidence
             for own in self.search.errors.trials
         ]
+        return (*self._measured[np.array(without) < least].tolist(),)
+
+    @property
+    def _measured(self) -> Array:
+        """Indices of the trials with a measurement, shape (t,)."""
         rivals = self.search.rivals
-        trials = rivals.trials.index.numpy()[np.unique(rivals.measurements.trial)]
-        return (*trials[np.array(without) < least].tolist(),)
+        return rivals.trials.index.numpy()[np.unique(rivals.measurements.trial)]
 
     def chi_square(self, key: ModelKey) -> tuple[float, float]:
         """Return a model's chi-square and its tail, by all that is declared.
