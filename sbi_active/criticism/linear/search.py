@@ -266,7 +266,7 @@ class Search:
         if key not in self._rivals:
             is_random = self.rivals.simulator.is_stochastic
             reference = self.unit if is_random else None
-            given = {"reference": reference, "df": self.sensor.df}
+            given = {"reference": reference, "df": self.sensor.cells[0].df}
             self._rivals[key] = self.rivals.rival(key, **given)
         return self._rivals[key]
 

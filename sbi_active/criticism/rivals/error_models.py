@@ -99,14 +99,14 @@ class NoiseGrid:
     Attributes:
         cells: Cells of the correlation time and the noise model's own parameters.
         scales: Factors on the standard deviation, shape (j,).
-        log_weights: Log prior probabilities of these, shape (j,); None for equal ones.
+        log_weights: Log prior probabilities of these, shape (j,), or (1,) if equal.
         is_by_channel: Whether each channel has a size of its own, which nothing says:
             fits tell them (:meth:`sized`), and ``scales`` is their common factor.
     """
 
     cells: Sequence[NoiseCell]
     scales: Array = field(default_factory=lambda: np.ones(1))
-    log_weights: Array | None = None
+    log_weights: Array = field(default_factory=lambda: np.zeros(1))
     is_by_channel: bool = False
 
     @cached_property
@@ -118,9 +118,8 @@ class NoiseGrid:
     @cached_property
     def log_scale_prior(self) -> Array:
         """Log prior probability of each scale."""
-        if self.log_weights is None:
-            return np.full(len(self.scales), -np.log(len(self.scales)))
-        return self.log_weights - log_sum_exp(self.log_weights)
+        weights = np.broadcast_to(self.log_weights, self.scales.shape)
+        return weights - log_sum_exp(weights)
 
     @property
     def is_known(self) -> bool:
@@ -130,13 +129,8 @@ class NoiseGrid:
     @cached_property
     def has_size(self) -> bool:
         """Whether its size is declared, and its correlation at most unknown."""
-        first = self.cells[0].sd
-        return len(self.scales) == 1 and all((c.sd == first).all() for c in self.cells)
-
-    @property
-    def df(self) -> float:
-        """Degrees of freedom of t errors; inf for Gaussian ones."""
-        return float(np.median([cell.df for cell in self.cells]))
+        apart = np.ptp([cell.sd for cell in self.cells], axis=0)
+        return len(self.scales) == 1 and not apart.any()
 
     @property
     def typical_sd(self) -> Array:
@@ -234,9 +228,8 @@ class NoiseGrid:
 
     def sized(self, sds: Sequence[Array]) -> NoiseGrid:
         """Return this noise with one of some deviations, each of shape (N,)."""
-        return replace(
-            self, cells=[replace(c, sd=sd) for sd in sds for c in self.cells]
-        )
+        cells = [replace(c, sd=sd) for sd in sds for c in self.cells]
+        return replace(self, cells=cells)
 
     def with_extra(self, sd: Array) -> NoiseGrid:
         """Return this noise with an independent error of deviation sd, shape (N,)."""

@@ -17,8 +17,13 @@ from sbi_active.criticism.rivals.rival import Rival
 from sbi_active.inference.engine import WeightedDraws, search
 from sbi_active.inference.engine.search import SearchSettings, laplace_precision
 from sbi_active.inference.engine.settings import Settings
+from sbi_active.inference.engine.surface import features
 from sbi_active.inference.sampling.mixtures import StudentMixture, lower_factors
-from sbi_active.inference.sampling.weights import effective_sample_size, normalized
+from sbi_active.inference.sampling.weights import (
+    effective_sample_size,
+    largest_power,
+    normalized,
+)
 from sbi_active.seeding import derive_seed
 
 
@@ -139,16 +144,10 @@ class Fit:
         log_w = np.nan_to_num(log_w, nan=-1e9, neginf=-1e9, posinf=-1e9)
         if log_w.std() < 0.5:
             return u, residual
-        at = rng.choice(len(u), size=len(u), p=tempered(log_w, 0.2 * len(u)))
+        fewest = 0.2 * len(u)
+        power = largest_power(lambda p: effective_sample_size(p * log_w) >= fewest)
+        at = rng.choice(len(u), size=len(u), p=normalized(power * log_w))
         return u[at], residual[at]
-
-
-def tempered(log_w: Array, fewest: float) -> Array:
-    """Return weights, by a power of them that leaves some effective draws, (n,)."""
-    power = 1.0
-    while effective_sample_size(power * log_w) < fewest:
-        power *= 0.8
-    return normalized(power * log_w)
 
 
 #: Searches of modes. A wrong model explains nothing, so that no number of searches is
@@ -311,17 +310,11 @@ def local_roughness(rival: Rival, *, step: float, seed: int) -> tuple[Array, Arr
     return rough, u
 
 
-def quadratic(z: Array) -> Array:
-    """Return 1, z and all products of two, shape (n, (dim + 1) (dim + 2) / 2)."""
-    i, j = np.triu_indices(z.shape[1])
-    return np.concatenate([np.ones((len(z), 1)), z, z[:, i] * z[:, j]], 1)
-
-
 def _beside_quadratic(u: Array, x: Array) -> Array:
     """Return the deviation of x, shape (n, N), around a quadratic function of u."""
     dim = u.shape[1]
     scale = u.std(0)
-    basis = quadratic(u / np.where(scale > 0, scale, 1.0))
+    basis = features(u / np.where(scale > 0, scale, 1.0), 2)
     found = np.zeros(x.shape[1])
     for k, column in enumerate(x.T):
         has = np.isfinite(column)
