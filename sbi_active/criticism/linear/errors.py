@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 
 from sbi_active.arrays import Array
 from sbi_active.criticism.data.measurements import Measurements
-from sbi_active.criticism.linear.mixture import WIDTHS, Mixture, summed
+from sbi_active.criticism.linear.mixture import Mixture, summed
 from sbi_active.criticism.linear.model import LinearModel
 from sbi_active.criticism.linear.processes import (
     Filters,
@@ -194,7 +194,7 @@ class Errors:
         state = UNEXPLAINED if beside else None
         gram, log_weight = self.hypotheses(model, grams, some, state)
         log_weight = log_weight + model.offset[some[self.fold]].sum()
-        return summed(gram, log_weight, model, WIDTHS)
+        return summed(gram, log_weight, model)
 
     def hypotheses(
         self,

@@ -44,17 +44,15 @@ def either(one: Mixture, other: Mixture) -> float:
     return float(np.logaddexp(one.log_evidence, other.log_evidence) - np.log(2))
 
 
-def summed(
-    gram: Array, log_weight: Array, model: LinearModel, widths: Sequence[float] = (1.0,)
-) -> Mixture:
+def summed(gram: Array, log_weight: Array, model: LinearModel) -> Mixture:
     """Return the posterior of a linear model, summed over hypotheses of the errors.
 
     Args:
         gram: Gram matrices of its rows, shape (h, 1 + d, 1 + d).
         log_weight: Log prior probabilities, with the constants of densities, (h,).
-        model: Linear model with its prior.
-        widths: Factors on the scales of effects' priors, equally likely.
+        model: Linear model with its prior; scales of effects' priors are summed out.
     """
+    widths = WIDTHS if model.scaled.any() else (1.0,)
     log_z, means, covs = integrated(gram, model, widths)
     log_z = log_z + log_weight[:, None] - np.log(len(widths))
     total = float(log_sum_exp(log_z.ravel()))

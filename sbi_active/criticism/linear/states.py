@@ -137,7 +137,7 @@ class States:
             gram, log_p = errors.scaled(c.model.rows, scale, some)
             log_p = log_p - np.log(len(scale))
         log_p = log_p + self._beside_numbers(c, key.error, some)
-        return summed(gram, log_p, c.model, WIDTHS if key.effects else (1.0,))
+        return summed(gram, log_p, c.model)
 
     def _beside_numbers(
         self, c: Candidate, error: str | None, use: NDArray[np.bool_]
