@@ -1,7 +1,6 @@
-"""Inputs over time: from arrays and from tables, on one grid for all trials."""
+"""Inputs over time, on one grid for all trials; see test_trial_tables for tables."""
 
 import numpy as np
-import pandas as pd
 import pytest
 import torch
 
@@ -85,95 +84,3 @@ def test_bad_inputs(arguments, message):
     keywords = {"action": None, "input_times": FINE, "sample_times": TIMES, **arguments}
     with pytest.raises(ValueError, match=message):
         Trials(x=X, **keywords)
-
-
-# Inputs over time and start states from tables
-
-
-LONG = "trial,time_ms,input_voltage[V],x_speed[rad/s],start_angle[rad]"
-SAMPLES = ["a,0,1,0.1,.5", "a,100,2,0.2,.5", "b,0,3,0.3,.7", "b,100,4,0.4,.7"]
-OTHER = ["a,0,1", "a,10,2", "a,20,3", "b,0,4", "b,10,5", "b,20,6", "c,0,0", "c,10,0"]
-ROWS_OF_X = ["a,0,0.1", "a,0.02,0.2", "b,0.01,0.3"]
-
-
-def write(name, rows, header):
-    with open(name, "w") as file:
-        file.write("\n".join([header, *rows]) + "\n")
-
-
-def read(rows, header=LONG, **options):
-    write("trials.csv", rows, header)
-    return Trials.from_csv("trials.csv", **options)
-
-
-def beside(inputs=OTHER, **options):
-    write("inputs.csv", inputs, "trial,time_ms,input_u[V]")
-    return read(ROWS_OF_X, "trial,time,x_y", inputs="inputs.csv", **options)
-
-
-#: Table, what its inputs and x are, and the code of what is said.
-TABLES = {
-    "rows of inputs alone": (
-        "trial,time_ms,input_u,x_y|a,0,1,0.1|a,10,2,|b,0,1,0.3|b,10,2,",
-        *({"u": [[1, 2]] * 2}, [[0.1], [0.3]], ""),
-    ),
-    "rows of x alone hold the input": (
-        "trial,time_ms,input_u,x_y|a,0,1,0.1|a,10,2,0.3|a,15,,0.2|a,20,4,0.5",
-        *({"u": [[1, 2, 4]]}, [[0.1, 0.3, 0.2, 0.5]], "SA209"),
-    ),
-    "rows of each input alone, of a log of several topics": (
-        "trial,time,input_u,input_v,x_y|a,0,1,,|a,0.1,,5,|a,0.5,,,7|a,1,2,,|a,1.1,,6,"
-        "|a,1.5,,,8",
-        *({"u": [[1, 2, 2]], "v": [[5, 5, 6]]}, [[7, 8]], "SA209"),
-    ),
-}
-
-
-@pytest.mark.parametrize("case", TABLES)
-def test_inputs_of_a_table(case, recwarn):
-    table, inputs, x, code = TABLES[case]
-    header, *rows = table.split("|")
-    found = read(rows, header)
-    assert {k: v.tolist() for k, v in found.inputs.items()} == inputs
-    assert found.x.tolist() == x
-    assert "".join(getattr(w.message, "code", "") for w in recwarn) == code
-
-
-def test_inputs_stand_beside_x():
-    trials = read(SAMPLES)
-    assert trials.action_is_label
-    assert trials.inputs["voltage"].tolist() == [[1, 2], [3, 4]]
-    assert trials.input_labels == ("voltage [V]",)
-    assert trials.input_times.tolist() == [0, 0.1]
-    assert trials.start["angle"].tolist() == [0.5, 0.7]
-
-
-def test_inputs_come_from_another_file_on_their_own_grid():
-    trials = beside()
-    assert trials.inputs["u"].tolist() == [[1, 2, 3], [4, 5, 6]]
-    assert trials.sample_times[0].tolist() == [0, 0.02]
-    frames = [pd.read_csv(name) for name in ("trials.csv", "inputs.csv")]
-    again = Trials.from_dataframe(frames[0], inputs=frames[1])
-    assert torch.equal(again.inputs["u"], trials.inputs["u"])
-    lines = beside(["a,0,1", "a,10,2", "b,0,1", "b,5,2", "b,10,4"], input_hold="linear")
-    assert lines.inputs["u"][0].tolist() == [1, 1.5, 2]
-
-
-@pytest.mark.parametrize(
-    ("rows", "column", "message"),
-    [
-        (
-            ["a,0,1,5", "a,1,2,5"],
-            "action_u",
-            r"action_u, row 2 \(trial a\); got 2.0 after 1.0 .*input_",
-        ),
-        (
-            ["a,0,1,5", "a,1,1,5", "a,2,1,5", "a,9,1,5", "a,10,1,5"],
-            "input_u",
-            "no value from 2 to 9 for input 'u' of trial a",
-        ),
-    ],
-)
-def test_a_table_with_inputs_that_is_not_understood(rows, column, message):
-    with pytest.raises(ValueError, match=message):
-        read(rows, f"trial,time,{column},x_y")

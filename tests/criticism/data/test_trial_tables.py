@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+import torch
 
 from sbi_active.criticism import Trials
 
@@ -103,6 +104,11 @@ BAD = [
     (f"{SHORT}|1,0,5,1,5,2", "got 'Expected 4 fields in line 2, saw 6' in tr"),
     ("", "names of columns, .* got 'No columns .* in trials.csv"),
     (f"{SHORT}|1,0,1,", "at least one valid trial"),
+    (f"{SHORT.replace('v', 'u')}|a,0,1,5|a,1,2,5", r"action_u, .* got 2.0 .*input_"),
+    (
+        "trial,time,input_u,x_y" + "".join(f"|a,{t},1,5" for t in (0, 1, 2, 9, 10)),
+        "no value from 2 to 9 for input 'u' of trial a",
+    ),
 ]
 
 
@@ -243,3 +249,61 @@ def test_recordings_that_do_not_go_together(rows, header, message, tmp_path):
     write_run("b.csv", *rows, header=header)
     with pytest.raises(ValueError, match=message):
         Trials.from_csv("runs")
+
+
+# Inputs over time and start states from tables
+
+
+#: Table, what its inputs and x are, and the code of what is said.
+INPUTS = {
+    "rows of inputs alone": (
+        "trial,time_ms,input_u,x_y|a,0,1,0.1|a,10,2,|b,0,1,0.3|b,10,2,",
+        *({"u": [[1, 2]] * 2}, [[0.1], [0.3]], ""),
+    ),
+    "rows of x alone hold the input": (
+        "trial,time_ms,input_u,x_y|a,0,1,0.1|a,10,2,0.3|a,15,,0.2|a,20,4,0.5",
+        *({"u": [[1, 2, 4]]}, [[0.1, 0.3, 0.2, 0.5]], "SA209"),
+    ),
+    "rows of each input alone, of a log of several topics": (
+        "trial,time,input_u,input_v,x_y|a,0,1,,|a,0.1,,5,|a,0.5,,,7|a,1,2,,|a,1.1,,6,"
+        "|a,1.5,,,8",
+        *({"u": [[1, 2, 2]], "v": [[5, 5, 6]]}, [[7, 8]], "SA209"),
+    ),
+}
+
+
+@pytest.mark.parametrize("case", INPUTS)
+def test_inputs_of_a_table(case, recwarn):
+    table, inputs, x, code = INPUTS[case]
+    header, *rows = table.split("|")
+    found = read(rows, header)
+    assert {k: v.tolist() for k, v in found.inputs.items()} == inputs
+    assert found.x.tolist() == x
+    assert "".join(getattr(w.message, "code", "") for w in recwarn) == code
+
+
+def test_inputs_and_starts_stand_beside_x():
+    header = "trial,time_ms,input_voltage[V],x_speed[rad/s],start_angle[rad]"
+    rows = ["a,0,1,0.1,.5", "a,100,2,0.2,.5", "b,0,3,0.3,.7", "b,100,4,0.4,.7"]
+    trials = read(rows, header)
+    assert trials.action_is_label
+    assert trials.inputs["voltage"].tolist() == [[1, 2], [3, 4]]
+    assert trials.input_labels == ("voltage [V]",)
+    assert trials.input_times.tolist() == [0, 0.1]
+    assert trials.start["angle"].tolist() == [0.5, 0.7]
+
+
+def test_inputs_come_from_another_file_on_their_own_grid():
+    columns = {"trial": [*"aaabbbcc"], "time_ms": [0, 10, 20, 0, 10, 20, 0, 10]}
+    other = pd.DataFrame({**columns, "input_u[V]": [1, 2, 3, 4, 5, 6, 0, 0]})
+    other.to_csv("inputs.csv", index=False)
+    rows = ["a,0,0.1", "a,0.02,0.2", "b,0.01,0.3"]
+    trials = read(rows, "trial,time,x_y", inputs="inputs.csv")
+    assert trials.inputs["u"].tolist() == [[1, 2, 3], [4, 5, 6]]
+    assert trials.sample_times[0].tolist() == [0, 0.02]
+    frame = pd.read_csv("trials.csv")
+    again = Trials.from_dataframe(frame, inputs=other)
+    assert torch.equal(again.inputs["u"], trials.inputs["u"])
+    finer = other.assign(time_ms=[0, 10, 20, 0, 5, 10, 0, 10])
+    lines = Trials.from_dataframe(frame, inputs=finer, input_hold="linear")
+    assert lines.inputs["u"][0].tolist() == [1, 1.5, 2, 2.5, 3]

@@ -1,16 +1,12 @@
 """Trials as they come: arrays, names, roles, repeats, and units."""
 
-import warnings
-
 import numpy as np
 import pandas as pd
 import pytest
 import torch
 
-from benchmarks.robots.models import SPRING_MASS
 from sbi_active.criticism import Trials
 from sbi_active.criticism.data.columns import to_si
-from sbi_active.mujoco import from_mjcf
 
 
 def test_roles_names_and_places_stay_with_their_trials():
@@ -98,7 +94,7 @@ def test_repeats_are_found_and_stay_together_where_the_first_is_left_out():
     assert told.repeat_of.tolist() == [-1, 0, 0, -1]
 
 
-# Units of headers: one reading of them, for tables and for logs of robots
+# Units of headers; see mujoco/test_recordings for logs of robots
 
 
 UNITS = {"time": "ms", "action_v": "deg/s", "x_y": "mm", "input_u": "mNm"}
@@ -145,53 +141,3 @@ def test_numbers_of_a_table_become_si(where, tmp_path):
     assert trials.inputs["u"].flatten().tolist() == pytest.approx([0.001, 0.003])
     assert trials.action_labels == ("v [rad/s]",)
     assert trials.channel_labels == ("y [m]",)
-
-
-def logs(scale=1e3, units=("ms", "mm", "mm/s"), **more):
-    """Two logs at 100 Hz, of which the position was read at 10 Hz."""
-    t = np.arange(0, 1, 0.01)
-    time, position, speed = (f" [{unit}]" if unit else "" for unit in units)
-    slow = np.where(np.arange(100) % 10, np.nan, t)
-    columns = {
-        f"time{time}": scale * t,
-        "push [N]": np.sin(5 * t),
-        f"position{position}": scale * slow,
-        f"speed{speed}": scale * t,
-        f"start slide{position}": 0 * t + scale * 0.1,
-    }
-    frame = pd.DataFrame(columns | more)
-    return [frame, frame.assign(**{"push [N]": np.sin(6 * t)})]
-
-
-def read_robot(recordings):
-    masses = {"cart.mass": (0.5, 2)}
-    return from_mjcf(SPRING_MASS, masses, recordings=recordings, noise=0.01).trials
-
-
-def test_logs_of_a_robot_become_si_as_tables_do(tmp_path):
-    for k, log in enumerate(logs()):
-        log.to_csv(tmp_path / f"{k}.csv", index=False)
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        converted, same = read_robot(tmp_path), read_robot(logs(1.0, ("", "", "")))
-    assert len(converted) == 2
-    for name in ("x", "sample_times", "input_times"):
-        found, expected = getattr(converted, name), getattr(same, name)
-        assert np.allclose(found, expected, equal_nan=True), name
-    assert converted.x[:, :, 0].isfinite().sum() == 20
-
-    assert converted.start["slide"].tolist() == pytest.approx([0.1, 0.1])
-
-
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"units": ("ms", "px", "")}, r"'position' in m; got \[px\] in the rec"),
-        ({"units": ("ms", "deg", "")}, r"'position' in m; got \[deg\] in the rec"),
-        ({"units": ("mm", "", "")}, r"times in s, .* got mm"),
-        ({"position [m]": 0.0}, "each quantity once; got position .* and"),
-    ],
-)
-def test_units_that_cannot_be_those_of_the_model_are_refused(changes, message):
-    with pytest.raises(ValueError, match=message):
-        read_robot(logs(**changes))
