@@ -47,11 +47,6 @@ def test_what_a_motor_lacks_is_found_proposed_and_simulated_on():
     assert float(error.square().mean().sqrt()) > 0.1
 
 
-def test_a_right_model_is_left_alone():
-    found = Criticism(MODEL, PRIOR, measured(3, {}), effects=LIBRARY)
-    assert found.trace().verdict == "none"
-
-
 def summed(theta, action, *, inputs, start=0.0):
     return theta * inputs["u"].sum(1, keepdim=True) + action + start
 
@@ -181,7 +176,3 @@ def test_nobody_looks_where_it_is_not_asked_for_or_no_sensor_is_declared(options
     criticism = loop(0.05, **options)
     assert criticism.sampling is None
     assert criticism.trials.mask.all()
-
-
-def test_what_the_sensor_alone_gets_wrong_is_kept():
-    assert loop(0.0).sampling.every == 1

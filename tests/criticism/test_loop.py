@@ -36,9 +36,6 @@ DRIFT = on_outcomes(
 )
 GAIN = on_outcomes("gain", lambda x, phi, action, context: x * (1 + phi), sd=0.3)
 LIBRARY = [BIAS, CUBIC, DRIFT, GAIN]
-OUTSIDE = on_outcomes(
-    "ripple", lambda x, phi, action, context: x + phi * torch.sin(4 * action)
-)
 
 
 def measured(seed, phi, *, num=10, held_out=0):
@@ -47,7 +44,7 @@ def measured(seed, phi, *, num=10, held_out=0):
     total = num + held_out
     theta = (6 * torch.rand(1, 2, generator=gen) - 3).expand(total, -1)
     action = ACTIONS.values[torch.randint(17, (total,), generator=gen)]
-    real = AugmentedSimulator(MODEL, [*LIBRARY, OUTSIDE])
+    real = AugmentedSimulator(MODEL, LIBRARY)
     phi = {k: torch.full((total, 1), v) for k, v in phi.items()}
     index = torch.arange(float(total))
     x = real.evaluate(theta, phi, action, index=index)
@@ -79,18 +76,6 @@ def test_hidden_effects_are_named_and_measured(name):
     for k, size in zip(own.names[2:], sizes.values(), strict=True):
         draws = own.draws[:, own.names.index(k)]
         assert abs(draws.mean() - size) < 4 * draws.std()
-
-
-@pytest.mark.parametrize(
-    ("seed", "phi", "scatter", "verdicts"),
-    [(3, {"ripple": 1.0}, 0.0, ("unexplained", "scatter")), (5, {}, 0.6, ("scatter",))],
-)
-def test_what_the_library_lacks_is_not_traced_to_it(seed, phi, scatter, verdicts):
-    own = measured(seed, phi, num=16)
-    noise = torch.randn(16, 1, generator=torch.Generator().manual_seed(0))
-    trials = Trials(own.action, own.x + scatter * noise)
-    tracing = Criticism(MODEL, PRIOR, trials, effects=LIBRARY, actions=ACTIONS).trace()
-    assert tracing.verdict in verdicts
 
 
 def test_drift_is_bias_and_slope_where_actions_run_in_order():

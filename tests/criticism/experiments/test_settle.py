@@ -83,9 +83,8 @@ def test_the_alias_is_withdrawn_by_the_rule_that_named_it():
     assert "failed" in str(report)
 
 
-@pytest.mark.parametrize("seed", range(2))
-def test_a_clean_simulator_loses_at_most_one_trial(seed):
-    robot = Robot(seed=seed)
+def test_a_clean_simulator_loses_at_most_one_trial():
+    robot = Robot()
     report = loop(robot, robot.trials())
     assert report.verdict == "none"
     assert len(robot.asked) <= 1
@@ -121,38 +120,12 @@ WAVE = SimulatorModel(
 )
 
 
-def wandering(num, seed):
-    """Return trials of a wave beside a process that nobody declared, and a further."""
-    gen = torch.Generator().manual_seed(seed)
-    action = torch.linspace(-1, 1, num)[:, None] + 2.0
-    phase = 6.28 * torch.rand((num, 1), generator=gen, dtype=torch.float64)
-    x = action * torch.sin(1.5 * TIMES) + 0.1 * torch.sin(2 * TIMES + phase)
-    return action, x + 0.01 * torch.randn(x.shape, generator=gen)
-
-
-def test_predictions_where_every_model_misses_are_as_wide_as_left_out_errors():
-    held, sizes = [], []
-    prior = BoxUniform(torch.tensor([0.5]), torch.tensor([2.5]))
-    for seed in range(5):
-        action, x = wandering(9, seed)
-        report = close_loop(
-            *(WAVE, prior, Trials(action[:8], x[:8], sample_times=TIMES)),
-            actions=DiscreteActions(action[8:]),
-            real_system=lambda action, x=x: x[8],
-            **{"max_trials": 1, "evaluate": False},
-        )
-        (trial,) = report.tested
-        assert report.tracing.misfit is not None
-        held.append(trial.held)
-        sizes.append(trial.registered.limit * trial.registered.sd.mean())
-    # The process has a root mean square of .07; t of 8 trials widens its 90 % limit.
-    assert sum(held) >= 3  # fewer of 5 at .9 have a probability of .009
-    assert 0.07 < np.mean(sizes) < 0.2
-
-
 def test_no_effect_is_named_whose_predictions_did_not_hold():
-    action, x = wandering(9, 0)
-    x = x + 0.5
+    gen = torch.Generator().manual_seed(0)
+    action = torch.linspace(1, 3, 9)[:, None]
+    phase = 6.28 * torch.rand((9, 1), generator=gen, dtype=torch.float64)
+    x = action * torch.sin(1.5 * TIMES) + 0.1 * torch.sin(2 * TIMES + phase) + 0.5
+    x = x + 0.01 * torch.randn(x.shape, generator=gen)
     report = close_loop(
         *(WAVE, BoxUniform(torch.tensor([0.5]), torch.tensor([2.5]))),
         Trials(action[:8], x[:8], sample_times=TIMES),

@@ -1,6 +1,5 @@
-"""Parameters at bounds of the prior, and numbers that do not follow in time."""
+"""Parameters at bounds of the prior."""
 
-import math
 from dataclasses import replace
 
 import numpy as np
@@ -128,81 +127,3 @@ def test_a_bare_model_that_explains_at_its_bound_says_so(low, is_said):
     assert (
         ("SA103" in codes(report)) == is_said == bool(report.tracing.bounds.parameters)
     )
-
-
-# Numbers that do not follow each other in time, beside what nobody declared
-
-
-SCALE, NUM_TRIALS = 0.05, 16
-THETA, QUADRATIC, HIDDEN = (1.0, 0.5), 0.8, 0.4
-PRIOR = Independent(Normal(torch.zeros(2), 2 * torch.ones(2)), 1)
-EFFECTS = [
-    Effect.keyword("quadratic", prior=Normal(0.0, 1.0)),
-    Effect.keyword("step", prior=Normal(0.0, 1.0)),
-]
-
-
-def line(theta, action, *, quadratic=0.0, step=0.0, hidden=0.0):
-    """Return one number a trial, (n, 1)."""
-    a = action[:, 0].to(theta)
-    x = theta[:, 0] + theta[:, 1] * a + quadratic * a**2 + step * (a > 0)
-    return (x + hidden * torch.sin(4 * a))[:, None]
-
-
-def trials(**effects) -> Trials:
-    action = torch.linspace(-2, 2, NUM_TRIALS)[:, None]
-    x = line(torch.tensor(THETA).expand(NUM_TRIALS, -1), action, **effects)
-    generator = torch.Generator().manual_seed(3)
-    return Trials(action, x + SCALE * torch.randn(x.shape, generator=generator))
-
-
-def loop(own: Trials, fn=line, scale=SCALE) -> Criticism:
-    model = SimulatorModel(fn, noise=GaussianNoise(scale))
-    return Criticism(model, PRIOR, own, effects=EFFECTS, seed=0)
-
-
-def test_the_cause_is_named_beside_what_nobody_declared():
-    """Trials with a quadratic term, beside a wave, whose error the intervals hold."""
-    beside = loop(trials(quadratic=QUADRATIC, hidden=HIDDEN))
-    misfit = beside.trace().misfit
-    assert beside.trace().verdict == "quadratic"
-    assert misfit.named == ("quadratic",)
-    assert not misfit.passes
-    assert 2 < misfit.size < 20
-    assert math.isnan(misfit.time_scale)
-    # One of about twenty formulas is the effect: their mean is log(20) = 3 nats below.
-    assert -4 < misfit.support["quadratic"].guessed < 0
-    draws = beside.trace().evidences["quadratic"].draws
-    mean, sd = draws.mean(0), draws.std(0)
-    assert (abs(mean - (*THETA, QUADRATIC)) < 3 * sd).all()
-    assert sd.min() > 0.4 * HIDDEN / NUM_TRIALS**0.5
-
-
-def test_a_formula_that_does_better_leaves_an_imitation_unnamed():
-    """A power of 1.5 is not declared; the quadratic takes up 99 % of its excess."""
-    own = trials()
-    found = loop(Trials(own.action, own.x + 2 * own.action.abs() ** 1.5))
-    report = found.report(evaluate=False, plan=False)
-    misfit = report.tracing.misfit
-    assert misfit.helps == ("quadratic",)
-    assert misfit.support["quadratic"].remains < 0.02
-    assert misfit.support["quadratic"].guessed > 10
-    assert misfit.named == ()
-    assert report.guess == "|xi|^1.5"
-
-
-def test_held_out_errors_are_told_number_by_number_as_left_out_ones_are():
-    """Two numbers in units of their own: their errors have no common size."""
-    unit, gen = torch.tensor([1.0, 100.0]), torch.Generator().manual_seed(3)
-
-    def both(theta, action, **effects):
-        return line(theta, action, **effects) * unit
-
-    action = torch.linspace(-2, 2, 24)[torch.randperm(24, generator=gen)][:, None]
-    x = both(torch.tensor(THETA).expand(24, -1), action, quadratic=0.8, hidden=HIDDEN)
-    x = x + SCALE * unit * torch.randn(x.shape, generator=gen)
-    own = Trials(action, x, role=["fit"] * NUM_TRIALS + ["held out"] * 8)
-    for found in loop(own, both, SCALE * unit).trace().misfit.models:
-        held_out = found.held_out / unit.numpy()
-        assert held_out.max() < 2 * held_out.min()
-        assert found.left_out.shape == found.held_out.shape

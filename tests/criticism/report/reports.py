@@ -140,11 +140,6 @@ def evaluation(num: int = 8) -> Evaluation:
     )
 
 
-def flat(made) -> str:
-    """Return the text of a report as one line."""
-    return " ".join(str(made).split())
-
-
 def trials(action=SHUFFLED[:8]) -> Trials:
     return Trials(torch.tensor(action), torch.randn(len(action), 6))
 

@@ -26,6 +26,8 @@ def test_a_dictionary_has_no_probabilities_where_they_contradict_the_verdict():
     assert plain["misfit"] is None
     withdrawn = report(tracing=tracing("unexplained", instead_of="drag")).to_dict()
     assert withdrawn["probabilities"] is withdrawn["credible_set"] is None
+    guessed = tracing("unexplained", guesses=(("xi^2", 9.0),))
+    assert report(tracing=guessed).guess == "xi^2"
 
 
 def test_a_report_goes_through_json_with_all_sections():
