@@ -47,27 +47,6 @@ def test_what_a_motor_lacks_is_found_proposed_and_simulated_on():
     assert float(error.square().mean().sqrt()) > 0.1
 
 
-def summed(theta, action, *, inputs, start=0.0):
-    return theta * inputs["u"].sum(1, keepdim=True) + action + start
-
-
-@pytest.mark.parametrize(
-    ("start", "repeats", "expected"),
-    [
-        (None, [-1, -1, 0], [3.0, 7.0, 3.0]),
-        ([1.0, 2.0, 3.0], [-1] * 3, [4.0, 9.0, 6.0]),
-    ],
-)
-def test_equal_actions_with_other_inputs_are_other_rows(start, repeats, expected):
-    model = SimulatorModel(summed, noise=GaussianNoise(0.1))
-    inputs = {"u": torch.tensor([[1.0, 2.0], [3.0, 4.0], [1.0, 2.0]])}
-    given = {"inputs": inputs, "input_times": [0.0, 1.0], "start": start}
-    trials = Trials(torch.zeros(3), torch.zeros(3), **given)
-    assert trials.repeat_of.tolist() == repeats
-    simulator = TrialSimulator(AugmentedSimulator(model, []), trials)
-    assert simulator.predict(torch.ones(1, 1), {})[0].tolist() == [expected]
-
-
 def test_a_function_of_one_row_gets_its_own_inputs():
     shapes = []
 

@@ -1,7 +1,5 @@
 """The loop on a small model whose truth is drawn in one place."""
 
-import math
-
 import numpy as np
 import pytest
 import torch
@@ -89,19 +87,11 @@ def test_drift_is_bias_and_slope_where_actions_run_in_order():
     assert tracing.equivalent == ()
 
 
-def test_the_error_falls_on_held_out_trials():
-    trials = measured(1, {"cubic": -0.5}, held_out=10)
-    criticism = Criticism(MODEL, PRIOR, trials, effects=LIBRARY, actions=ACTIONS)
-    evaluation = criticism.evaluate()
-    rmse = evaluation.table.set_index("metric").loc["rmse"]
-    assert evaluation.scheme == "held out"
-    assert rmse["ratio"] < 0.5
-    assert rmse["high"] < 1
-    # RMSE of 10 numbers with noise of 0.1: standard error 0.1 / sqrt(20).
-    assert rmse["after"] < NOISE * (1.2 + 4 / math.sqrt(20))
-    few = Criticism(MODEL, PRIOR, trials[:6], effects=[BIAS, CUBIC]).evaluate()
+def test_below_eight_trials_an_error_has_no_interval():
+    trials = measured(1, {"cubic": -0.5}, num=6)
+    few = Criticism(MODEL, PRIOR, trials, effects=[BIAS, CUBIC]).evaluate()
     assert few.scheme == "leave one out"
-    assert np.isnan(few.table["low"]).all()  # below 8 trials there is none
+    assert np.isnan(few.table["low"]).all()
 
 
 def test_nothing_is_added_to_a_right_model():

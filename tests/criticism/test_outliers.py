@@ -75,10 +75,9 @@ def test_a_slip_along_a_trajectory_is_an_outlier_and_no_process(num, wrong):
     assert credible_set(found.outliers) == (float(wrong),)
 
 
-@pytest.mark.parametrize("wrong", [-1e30, "unit"])
-def test_what_nothing_explains_ends_no_loop(wrong):
+def test_what_nothing_explains_ends_no_loop():
     x = measured()
-    x[2] = 100 * x[2] if wrong == "unit" else wrong
+    x[2] = -1e30
     found = criticism(x).trace()
     assert found.verdict == "outlier"
     assert credible_set(found.outliers) == (2.0,)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from benchmarks.robots.models import PENDULUM, TIMES
+from benchmarks.robots.models import PENDULUM
 from sbi_active.criticism import AugmentedSimulator, Effect, Trials
 from sbi_active.criticism.effects.effect import UnderKey
 from sbi_active.mujoco import from_mjcf, mjcf_effects
@@ -64,14 +64,8 @@ def test_every_effect_vanishes_at_its_null_and_moves_the_robot(robot, effects):
 def test_fields_are_those_of_the_mjcf(robot, effects):
     def native(**attributes):
         text = " ".join(f'{k}="{v}"' for k, v in attributes.items())
-        other = from_mjcf(
-            PENDULUM.replace('damping="0.03"', f'damping="0.03" {text}'),
-            {"hinge.damping": (0.0, 0.1)},
-            sensors=["hinge"],
-            actions=robot.actions,
-            times=TIMES,
-            noise=0.01,
-        )
+        spec = PENDULUM.replace('damping="0.03"', f'damping="0.03" {text}')
+        other = pendulum(spec, parameters={"hinge.damping": (0.0, 0.1)})
         theta = torch.full((1, 1), 0.03, dtype=torch.float64)
         return other.simulator.mean(theta, torch.ones(1, 1, dtype=torch.float64))
 
@@ -88,6 +82,7 @@ def test_contacts_are_offered_where_something_touches():
     robot = from_mjcf(
         BALL, {"ball.mass": (0.05, 0.2)}, times=np.arange(0.02, 0.8, 0.02)
     )
+    assert robot.simulator.noise.sd == pytest.approx(0.001)  # as the sensor says
     found = mjcf_effects(robot, include=["*softness", "*restitution"])
     assert "contact restitution" in {e.name for e in found}
     (effect,) = (e for e in found if e.name == "contact restitution")

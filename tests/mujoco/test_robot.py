@@ -2,7 +2,6 @@
 
 import pickle
 
-import mujoco
 import numpy as np
 import pytest
 import torch
@@ -20,7 +19,7 @@ from tests.mujoco.machines import stepped
 RELEASE = BoxActions([-1.5], [1.5], names=["hinge"])
 
 
-def pendulum(**options) -> Robot:
+def pendulum(text: str = PENDULUM, **options) -> Robot:
     given = {
         "parameters": {"hinge.damping": (0.0, 0.1), "bob.mass": (0.5, 2.0)},
         "sensors": ["hinge"],
@@ -28,7 +27,7 @@ def pendulum(**options) -> Robot:
         "times": TIMES,
         "noise": 0.01,
     }
-    return from_mjcf(PENDULUM, **{**given, **options})
+    return from_mjcf(text, **{**given, **options})
 
 
 def test_a_pendulum_moves_as_one_stepped_by_hand():
@@ -58,19 +57,6 @@ def test_rows_do_not_depend_on_batches_or_workers():
     assert (one == again[:9]).all()
 
 
-@pytest.mark.parametrize("given", ["text", "path", "spec"])
-def test_a_model_comes_as_text_path_or_spec(given, tmp_path):
-    file = tmp_path / "pendulum.xml"
-    file.write_text(PENDULUM)
-    spec = mujoco.MjSpec.from_string(PENDULUM)
-    source = {"text": PENDULUM, "path": file, "spec": spec}[given]
-    robot = from_mjcf(source, {"hinge.damping": (0.0, 0.1)}, times=TIMES)
-    assert robot.simulator.noise.sd == pytest.approx(0.01)
-    x = robot.simulator.mean(torch.full((1, 1), 0.05), torch.zeros(1, 1))
-    assert x.shape == (1, 15)
-    assert (x == 0).all()
-
-
 def length(spec, value):
     spec.body("bob").first_geom().fromto = [0, 0, 0, 0, 0, -value]
 
@@ -93,14 +79,7 @@ def test_what_only_the_spec_says_is_written_or_compiled(edit, old, new, is_affin
     x = robot.simulator.mean(theta, action)
     for row in range(2):
         text = PENDULUM.replace(old, new.format(theta[row].item()))
-        other = from_mjcf(
-            text,
-            {"hinge.damping": (0.0, 0.1)},
-            sensors=["hinge"],
-            actions=RELEASE,
-            times=TIMES,
-            noise=0.01,
-        )
+        other = pendulum(text, parameters={"hinge.damping": (0.0, 0.1)})
         own = torch.full((1, 1), 0.03, dtype=torch.float64)
         same = other.simulator.mean(own, action[row : row + 1])
         assert x[row].numpy() == pytest.approx(same[0].numpy(), abs=1e-7)

@@ -38,21 +38,11 @@ def posterior_of(history: str, variant: str = "linear") -> ExactPosterior:
     return ExactPosterior(action, x, variant=variant)
 
 
-def gain_error(
-    posterior: ExactPosterior,
-    action: float,
-    *,
-    truth: ExactPosterior | None = None,
-    noise_sd: float = 1.0,
-) -> float:
-    """Monte Carlo gain less the exact one, in Monte Carlo standard errors.
-
-    Truths come from another posterior, or the noise has another width, in the negative
-    controls only.
-    """
+def gain_error(posterior: ExactPosterior, action: float) -> float:
+    """Monte Carlo gain less the exact one, in Monte Carlo standard errors."""
     rng = np.random.default_rng(1)
-    theta = (truth or posterior).sample(1500, seed=rng)
-    noise = noise_sd * torch.from_numpy(rng.standard_normal(len(theta)))
+    theta = posterior.sample(1500, seed=rng)
+    noise = torch.from_numpy(rng.standard_normal(len(theta)))
     x = noise_free(theta, [action], variant=posterior.variant)[:, 0] + noise
     log_likelihood = -0.5 * noise**2 - 0.5 * np.log(2 * np.pi)
     gain = log_likelihood - posterior.log_predictive(x, action)

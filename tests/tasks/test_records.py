@@ -26,13 +26,7 @@ from sbi_active.tasks.servo_pendulum import (
     ServoPendulumTask,
     read_recordings,
 )
-from sbi_active.tasks.servo_pendulum.model import (
-    GRAVITY,
-    LENGTH,
-    MASS,
-    STEP,
-    SUPPLY,
-)
+from sbi_active.tasks.servo_pendulum.model import GRAVITY, LENGTH, MASS, STEP, SUPPLY
 from sbi_active.tasks.stepping import lagged  # pyright: ignore
 
 HOOP = torch.tensor([[7.3, 0.8, 0.0]], dtype=torch.float64)

@@ -26,6 +26,8 @@ def test_without_actions_the_action_is_a_label(action):
     assert found.repeat_of.tolist() == [-1, 0]
     other = Trials(action, X, inputs=torch.randn(2, 11), input_times=FINE)
     assert other.repeat_of.tolist() == [-1, -1]
+    moved = trials(torch.zeros(2, 11), start=torch.tensor([1.0, 2.0]))
+    assert moved.repeat_of.tolist() == [-1, -1]
 
 
 def test_inputs_may_have_clocks_of_their_own():

@@ -59,17 +59,6 @@ def test_what_is_read(table, options, expected):
         assert own == value, name
 
 
-def test_a_row_a_sample_gives_ragged_trials():
-    found = read(SAMPLES)
-    assert found.x.nan_to_num(-1).tolist() == [[5.0, 4.9, -1], [5.2, 5.1, 4.0]]
-    assert found.action.tolist() == [[1], [2]]
-    assert found.role == ["fit", "fit"]
-    last = found.select([1])  # keeps what is its own
-    assert (last.names, last.order) == (("b",), "known")
-    assert last.action_labels == ("speed [m/s]",)
-    assert last.channel_labels == ("height [m]",)
-
-
 def test_a_frame_is_read_as_its_file():
     trials = read([*SAMPLES])
     frame = pd.read_csv("trials.csv")
@@ -77,6 +66,7 @@ def test_a_frame_is_read_as_its_file():
     assert same.order == "unknown"
     assert same.x.nan_to_num(0).equal(trials.x.nan_to_num(0))
     assert same.action_labels == trials.action_labels
+    assert trials[1:].channel_labels == ("height [m]",)  # a part keeps its own
     frame.loc[1, "x_height[m]"] = np.nan
     with pytest.warns(UserWarning, match=r"1 of 5 cells .* row 2 \(trial a\)") as noted:
         lost = Trials.from_dataframe(frame)

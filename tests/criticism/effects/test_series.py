@@ -8,11 +8,7 @@ import torch
 from sbi.utils import BoxUniform
 
 from sbi_active import GaussianNoise, SimulatorModel
-from sbi_active.criticism import (
-    Trials,
-    close_loop,
-    varying_parameters,
-)
+from sbi_active.criticism import Trials, close_loop, varying_parameters
 from sbi_active.criticism.effects.changes import (
     delayed_input,
     delayed_samples,

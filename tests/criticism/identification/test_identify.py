@@ -14,11 +14,10 @@ from sbi_active.criticism import Trials
 from sbi_active.criticism.identification import IdentifySettings, identify
 from sbi_active.criticism.identification.posterior import ChannelErrors, Posterior
 from sbi_active.criticism.linear.mixture import integrated
-from sbi_active.criticism.linear.model import LinearModel
 from sbi_active.criticism.linear.processes import Grams, Processes
-from sbi_active.criticism.results import ModelKey
 from sbi_active.inference.sampling.mixtures import draws_between
 from sbi_active.mujoco import randomization
+from tests.criticism.linear.linear_models import linear_model
 from tests.effects import autocorrelated, on_outcomes
 
 WHITE = Processes(np.ones(1), np.zeros(1), np.full(1, np.inf), np.zeros(1, bool))
@@ -29,21 +28,9 @@ def linear(num=200, strength=0.0, seed=0, low=-np.inf, sd=(1e3, 1e3, 1.0)):
     rng = np.random.default_rng(seed)
     t = np.linspace(-1, 1, num)
     jacobian = np.stack([np.ones(num), t, t**2 - 1 / 3], 1)
-    return LinearModel(
-        key=ModelKey(),
-        u=np.zeros(3),
-        residual=rng.standard_normal(num) - strength * jacobian[:, 2],
-        jacobian=jacobian,
-        center=np.zeros(3),
-        sd=np.array(sd),
-        scaled=np.zeros(3, bool),
-        low=np.array([low, -np.inf, -np.inf]),
-        high=np.full(3, np.inf),
-        trial_of=np.full(3, -1),
-        num=num,
-        scale=np.ones(num),
-        offset=np.zeros(num),
-    )
+    residual = rng.standard_normal(num) - strength * jacobian[:, 2]
+    bounds = np.array([low, -np.inf, -np.inf])
+    return linear_model(residual, jacobian, sd=np.array(sd), low=bounds)
 
 
 def white(model, known: np.ndarray | None):

@@ -11,7 +11,6 @@ from sbi_active import DiscreteActions, GaussianNoise, SimulatorModel
 from sbi_active.criticism import Criticism, Trials
 from sbi_active.criticism.forces import force_effects
 from sbi_active.criticism.results import SCATTER, UNEXPLAINED, ModelKey
-from sbi_active.criticism.rivals.rival_set import RivalSet
 from sbi_active.criticism.steps.detection import REFUTED
 from tests.criticism.forces.test_forces import MODEL, PRIOR, SD, measured
 from tests.criticism.misfit.oscillator import EFFECTS, SENSOR, TIMES, oscillate
@@ -52,19 +51,6 @@ def test_the_error_falls_on_left_out_trials_or_the_verdict_is_withdrawn(loop):
     assert judged.chosen == ()
     assert judged.verdict == UNEXPLAINED
     assert judged.instead_of == loop.trace().verdict
-
-
-def test_linear_evidence_is_that_of_samples():
-    """Of a small library with an effect on the noise, and a missing bias."""
-    own, effects = oscillations(bias=0.05), [*EFFECTS, louder()]
-    tracing = Criticism(OSCILLATOR, RATES, own, effects=effects).trace()
-    assert tracing.verdict == "bias"
-    assert tracing.evidences["bias"].engine == "linear"
-    rivals = RivalSet(OSCILLATOR, RATES, own, effects, seed=0)
-    sampled = [rivals.fit(ModelKey(k)).evidence.log_evidence for k in ((), ("bias",))]
-    linear = [tracing.evidences[k].log_evidence for k in ("none", "bias")]
-    # The bare model, hundreds of nats behind, is linear no more: hence the share.
-    assert np.diff(linear) == pytest.approx(np.diff(sampled), abs=1.0, rel=0.01)
 
 
 @pytest.mark.parametrize("finer", [1, 10])

@@ -6,27 +6,15 @@ import numpy as np
 import pytest
 import torch
 from sbi.utils import BoxUniform
-from torch.distributions import HalfNormal, Independent, Normal
+from torch.distributions import Independent, Normal
 
 from sbi_active import GaussianNoise, SimulatorModel
 from sbi_active.criticism import Criticism, Effect, Trials
 from sbi_active.criticism.misfit.contrary import beyond_bounds
 from sbi_active.criticism.results import NONE, UNEXPLAINED
+from tests.criticism.block import DRAG, GAIN, ROLE, SENSOR, SPEEDS, friction, slid, stop
 
-SENSOR = 0.005
-SPEEDS = torch.tensor([1.0, 2.5, 1.5, 3.0, 2.0, 0.75, 2.75, 1.25, 2.25, 1.75])
 TIMES = torch.linspace(0.1, 1.0, 10)
-GAIN = Effect.keyword("gain", prior=Independent(Normal(torch.zeros(1), 0.2), 1))
-DRAG = Effect.keyword("drag", prior=Independent(HalfNormal(torch.ones(1)), 1))
-
-
-def stop(theta, action, *, gain=0.0, drag=0.0):
-    """Return the way of a block that slides to rest; a gain is as good as friction."""
-    if (theta <= 0).any():
-        raise ValueError("expected positive friction")
-    speed = action * (1 + torch.as_tensor(gain)[..., None])
-    drag = torch.as_tensor(drag)[..., None].clamp(min=1e-6)
-    return torch.log1p(drag * speed**2 / (9.81 * theta)) / (2 * drag)
 
 
 def slide(theta, action, **effects):
@@ -34,15 +22,11 @@ def slide(theta, action, **effects):
     return stop(theta, action, **effects) * (1 - torch.exp(-3 * TIMES))
 
 
-def criticism(low, *, high=1.0, effect=GAIN, fn=stop, drag=0.0, prior=None):
-    x = fn(torch.full((10, 1), 0.4), SPEEDS[:, None], drag=torch.full((10,), drag))
-    x = x + SENSOR * torch.randn(x.shape, generator=torch.Generator().manual_seed(0))
+def criticism(prior, *, effect=GAIN, fn=stop, drag=0.0):
     times = TIMES if fn is slide else None
     given = {"parameter_names": ["friction"], "sample_times": times}
     model = SimulatorModel(fn, noise=GaussianNoise(SENSOR), **given)
-    prior = prior or BoxUniform(torch.tensor([low]), torch.tensor([high]))
-    role = ["fit"] * 6 + ["held out"] * 4
-    trials = Trials(SPEEDS, x, role=role, sample_times=times)
+    trials = Trials(SPEEDS, slid(drag, fn), role=ROLE, sample_times=times)
     return Criticism(model, prior, trials, effects=[effect], seed=0)
 
 
@@ -58,7 +42,7 @@ def codes(report):
 @pytest.mark.parametrize("fn", [stop, slide])
 def test_an_effect_that_a_wider_prior_makes_up_for_is_not_named(fn):
     """A prior that begins at .5, where friction is .4."""
-    report = criticism(0.5, fn=fn).report(plan=False)
+    report = criticism(friction(0.5), fn=fn).report(plan=False)
     assert report.tracing.chosen == ()
     assert report.verdict == UNEXPLAINED
     assert report.tracing.instead_of == "gain"
@@ -73,7 +57,7 @@ def test_an_effect_that_a_wider_prior_makes_up_for_is_not_named(fn):
 
 
 def test_a_cause_that_no_bound_makes_up_for_stays_named():
-    report = criticism(0.1, high=0.42, effect=DRAG, drag=0.3).report(plan=False)
+    report = criticism(friction(0.1, 0.42), effect=DRAG, drag=0.3).report(plan=False)
     assert report.verdict == "drag"
     assert report.tracing.bounds.replaces == ""
     (found,) = report.tracing.bounds.parameters
@@ -84,7 +68,7 @@ def test_a_cause_that_no_bound_makes_up_for_stays_named():
 
 def test_a_narrow_prior_without_bounds_names_nothing_either():
     tight = Independent(Normal(torch.full((1,), 0.5), 0.01), 1)
-    tracing = criticism(0.1, prior=tight).report(plan=False).tracing
+    tracing = criticism(tight).report(plan=False).tracing
     assert tracing.chosen == ()
     assert tracing.verdict in (NONE, UNEXPLAINED)
 
@@ -92,15 +76,17 @@ def test_a_narrow_prior_without_bounds_names_nothing_either():
 def test_a_bound_of_phi_is_told_and_its_null_is_none():
     prior = BoxUniform(torch.zeros(1), torch.full((1,), 0.1))
     strong = Effect.keyword("drag", prior=prior)
-    loop = criticism(0.1, effect=strong, drag=0.3)
+    loop = criticism(friction(0.1), effect=strong, drag=0.3)
     assert loop.trace().chosen == ("drag",)
     tracing = beyond(loop, replace(loop.trace(), chosen=("drag",)))
     # Asked first of all, it has the posteriors as well.
-    assert criticism(0.1, effect=strong, drag=0.3).judged(None).bounds.parameters
+    assert (
+        criticism(friction(0.1), effect=strong, drag=0.3).judged(None).bounds.parameters
+    )
     (found,) = [p for p in tracing.bounds.parameters if p.name == "drag"]
     assert (found.model, found.side) == ("drag", "upper")
     assert found.beyond > 0.15
-    weak = criticism(0.1, effect=Effect.keyword("drag", prior=prior))
+    weak = criticism(friction(0.1), effect=Effect.keyword("drag", prior=prior))
     told = beyond(weak, replace(weak.trace(), chosen=("drag",)))
     assert told.bounds.parameters == ()
 
@@ -111,7 +97,7 @@ def test_a_simulator_that_refuses_what_is_beyond_is_asked_no_more():
             raise ValueError("expected friction of at least 0.5")
         return stop(theta, action, **effects)
 
-    loop = criticism(0.5)
+    loop = criticism(friction(0.5))
     loop.trace()
     loop.rivals.simulator.model.base.fn = refusing
     found = beyond(loop, loop.trace())
@@ -122,7 +108,7 @@ def test_a_simulator_that_refuses_what_is_beyond_is_asked_no_more():
 
 @pytest.mark.parametrize(("low", "is_said"), [(0.403, True), (0.1, False)])
 def test_a_bare_model_that_explains_at_its_bound_says_so(low, is_said):
-    report = criticism(low).report(plan=False)
+    report = criticism(friction(low)).report(plan=False)
     assert report.verdict == NONE
     assert (
         ("SA103" in codes(report)) == is_said == bool(report.tracing.bounds.parameters)

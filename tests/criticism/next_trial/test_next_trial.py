@@ -10,10 +10,7 @@ from scipy.stats import entropy
 
 from sbi_active import DiscreteActions, GaussianNoise, SimulatorModel
 from sbi_active.criticism import Criticism, Trials, next_action
-from sbi_active.criticism.next_action import (
-    beyond_range,
-    choose_action,
-)
+from sbi_active.criticism.next_action import beyond_range, choose_action
 from tests.criticism.misfit.oscillator import ACTION, EFFECTS, trials
 from tests.criticism.misfit.oscillator import MODEL as OSCILLATOR
 from tests.criticism.misfit.oscillator import PRIOR as RATES
@@ -74,19 +71,6 @@ def test_where_no_action_separates_none_is_named():
     assert chosen.action is None
     assert chosen.inseparable == (frozenset({"none", "gain"}),)
     assert chosen.outside is None
-
-
-def test_a_simulator_that_fails_outside_its_range_names_nothing():
-    def forward_only(theta, xi):
-        if bool((xi <= 0).any()):
-            raise ValueError("the gripper pushes forward")
-        return theta * xi
-
-    action = [1.0, 2.0, 3.0, 2.0]
-    c = criticism(action, 0.7 * torch.tensor(action), [TILT], FORWARD, forward_only)
-    chosen = c.next_action()
-    assert chosen.action is None
-    assert chosen.outside is None or float(chosen.outside[0]) > 0
 
 
 # Actions beyond the permitted ones

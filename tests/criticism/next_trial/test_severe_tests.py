@@ -7,11 +7,7 @@ from sbi.utils import BoxUniform
 
 from sbi_active import DiscreteActions, GaussianNoise, SimulatorModel
 from sbi_active.criticism import Criticism, Trials, generic_effects
-from sbi_active.criticism.next_action import (
-    beyond_range,
-    following,
-    severe_tests,
-)
+from sbi_active.criticism.next_action import beyond_range, following, severe_tests
 from sbi_active.criticism.steps.predictive import predict
 from tests.effects import BIAS
 

@@ -9,12 +9,13 @@ from sbi.utils import BoxUniform
 from scipy.stats import norm
 
 from sbi_active import AutocorrelatedNoise, GaussianNoise, SimulatorModel
-from sbi_active.criticism import Effect, Trials, close_loop
+from sbi_active.criticism import Trials, close_loop
 from sbi_active.criticism.misfit.contrary import unless_refuted
 from sbi_active.criticism.misfit.evaluation import evaluate_held_out
 from sbi_active.criticism.misfit.record import traced
 from sbi_active.criticism.results import NONE
 from sbi_active.criticism.steps.missed_trials import outlying_trials
+from tests.criticism.block import DRAG, ROLE, SENSOR, SPEEDS, friction, slid, stop
 from tests.criticism.misfit.oscillator import EFFECTS, MODEL, PRIOR
 from tests.criticism.misfit.oscillator import trials as oscillations
 from tests.criticism.report.reports import misfit
@@ -28,7 +29,7 @@ from tests.criticism.steps.linear_world import (
     posterior,
     rivals,
 )
-from tests.effects import autocorrelated, half
+from tests.effects import autocorrelated
 
 # What a verdict rests on
 
@@ -77,30 +78,10 @@ def test_one_that_errs_ten_times_as_much_is_named_and_ordinary_ones_rarely():
 # Held-out trials far outside what a verdict's model predicts, and no others
 
 
-SENSOR = 0.005
-SPEEDS = torch.tensor([1.0, 2.5, 1.5, 3.0, 2.0, 0.75, 2.75, 1.25, 2.25, 1.75])
-ROLE = ["fit"] * 6 + ["held out"] * 4
-
-
-def stop(theta, action, *, drag=0.0):
-    """Return the way of a block that slides to rest, without one beyond 9 m/s."""
-    drag = torch.as_tensor(drag)[..., None].clamp(min=1e-6)
-    way = torch.log1p(drag * action**2 / (9.81 * theta)) / (2 * drag)
-    return torch.where(action > 9, torch.nan, way)
-
-
-def slid(drag=0.0):
-    gen = torch.Generator().manual_seed(0)
-    x = stop(torch.full((10, 1), 0.4), SPEEDS[:, None], drag=torch.full((10,), drag))
-    return x + SENSOR * torch.randn(10, 1, generator=gen)
-
-
 def report_of(x, action=SPEEDS):
     model = SimulatorModel(stop, noise=GaussianNoise(SENSOR))
-    prior = BoxUniform(torch.tensor([0.1]), torch.tensor([1.0]))
     trials = Trials(action, x, role=ROLE)
-    drag = Effect.keyword("drag", prior=half())
-    return close_loop(model, prior, trials, effects=[drag], plan=False)
+    return close_loop(model, friction(0.1), trials, effects=[DRAG], plan=False)
 
 
 @pytest.fixture(scope="module")
