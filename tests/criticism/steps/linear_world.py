@@ -39,19 +39,13 @@ def measured(*, seed: int = 0, further: torch.Tensor | float = 0.0, **phi: float
     return x + sum((size * SHAPES[name](ACTION) for name, size in phi.items()), 0.0)
 
 
-def line(theta: torch.Tensor, action: torch.Tensor) -> torch.Tensor:
-    return theta[:, :1] + theta[:, 1:2] * action
-
-
-MODEL = SimulatorModel(line, noise=GaussianNoise(NOISE))
-
-
 def rivals(
-    x: torch.Tensor,
-    *further: Effect,
-    action: torch.Tensor = ACTION,
-    model: SimulatorModel = MODEL,
+    x: torch.Tensor, *further: Effect, action: torch.Tensor = ACTION
 ) -> RivalSet:
+    model = SimulatorModel(
+        lambda theta, action: theta[:, :1] + theta[:, 1:] * action,
+        noise=GaussianNoise(NOISE),
+    )
     effects = [*map(effect, SHAPES), *further]
     return RivalSet(model, PRIOR, Trials(action, x), effects)
 
