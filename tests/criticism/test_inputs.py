@@ -155,3 +155,7 @@ def test_nobody_looks_where_it_is_not_asked_for_or_no_sensor_is_declared(options
     criticism = loop(0.05, **options)
     assert criticism.sampling is None
     assert criticism.trials.mask.all()
+
+
+def test_what_the_sensor_alone_gets_wrong_is_kept():
+    assert loop(0.0).sampling.every == 1

@@ -95,6 +95,15 @@ def test_repeated_actions_are_simulated_once_and_predict_the_same():
     assert seen == [5 * 4, 5 * 6]
 
 
+def test_a_random_simulator_is_not_merged():
+    def draw(theta, action):
+        return smooth(theta, action) + torch.randn(len(theta), 1)
+
+    model = AugmentedSimulator(SimulatorModel(draw), [BIAS])
+    x = model.evaluate(torch.zeros(64, 2), {}, torch.ones(64, 1), merge=True)
+    assert len(x.unique()) > 32
+
+
 def test_jumps_far_from_the_fit_are_none_there():
     def curve(theta, action):
         rough = torch.round(20 * theta) / 20

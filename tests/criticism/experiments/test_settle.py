@@ -10,7 +10,11 @@ from sbi.utils import BoxUniform
 
 from sbi_active import DiscreteActions, GaussianNoise, SimulatorModel
 from sbi_active.criticism import Criticism, Trials, close_loop
-from sbi_active.criticism.experiments.choice import limit_of, unless_unproven
+from sbi_active.criticism.experiments.choice import (
+    limit_of,
+    probability_of,
+    unless_unproven,
+)
 from sbi_active.criticism.experiments.settle import NAME, VerdictError, settle
 from tests.effects import added
 
@@ -146,6 +150,7 @@ def test_no_effect_is_named_whose_predictions_did_not_hold():
     found = unless_unproven(report, [others])
     assert (found.verdict, found.tracing.beside) == ("unexplained", ("bias",))
     assert found.tracing.key == report.tracing.key  # it still predicts
+    assert probability_of(found) == 0.0
     assert found.warnings[-1].code == "SA533"
     assert "unexplained" in str(found).splitlines()[0]
 
