@@ -103,6 +103,27 @@ def test_heavy_tails_have_the_bayes_factor_of_importance_sampling(bias):
     assert weight.argmin() == 4
 
 
+def test_which_trials_have_an_outcome_tells_of_parameters_and_effects():
+    """A response that ends at a height; where it should not, none has one."""
+
+    def ends(theta, action):
+        x = curve(theta, action)
+        return torch.where(x > 1.0, torch.nan, x)
+
+    model = SimulatorModel(ends, noise=GaussianNoise(SD))
+    x = measured(seed=2)
+    x[curve(torch.tensor([[0.7, -0.4]]).double(), ACTION) > 1.0] = torch.nan
+    right = verdict_of(model, x)
+    assert not right.detection.alarm
+    lost = x.clone()
+    lost[[5, 6, 7]] = torch.nan  # about zero, where no parameters end it
+    missed = verdict_of(model, lost)
+    every = np.ones(missed.search.errors.num_folds, bool)
+    flags = missed.states._beside_numbers(missed.search.found[BARE], None, every)
+    # Three trials that have no outcome in one case in fifty.
+    assert flags == pytest.approx(3 * np.log(0.02 / 0.98), abs=0.5)
+
+
 def test_jumps_count_as_noise_and_an_effect_beside_them_is_named():
     model = SimulatorModel(
         lambda theta, xi: torch.round(curve(theta, xi) / 0.4) * 0.4,
