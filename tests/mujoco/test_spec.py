@@ -9,22 +9,12 @@ import pytest
 from sbi_active.mujoco.models.spec import Source
 
 CORNERS = [(x, y, z) for x in (0, 1) for y in (0, 1) for z in (0, 2)]
-BLOCK = """
-<mujoco>
-  <compiler meshdir="parts"/>
-  <asset>
-    <mesh name="block" file="block.obj"/>
-    <texture name="wood" type="2d" file="missing.png"/>
-    <material name="wooden" texture="wood" rgba="1 0 0 1"/>
-  </asset>
-  <worldbody>
-    <body>
-      <joint name="hinge" axis="0 1 0"/>
-      <geom type="mesh" mesh="block" material="wooden"/>
-    </body>
-  </worldbody>
-</mujoco>
-"""
+BLOCK = """<mujoco><compiler meshdir="parts"/>
+<asset><mesh name="block" file="block.obj"/>
+<texture name="wood" type="2d" file="missing.png"/>
+<material name="wooden" texture="wood" rgba="1 0 0 1"/></asset>
+<worldbody><body><joint name="hinge" axis="0 1 0"/>
+<geom type="mesh" mesh="block" material="wooden"/></body></worldbody></mujoco>"""
 
 
 @pytest.fixture

@@ -8,38 +8,19 @@ from sbi_active import BoxActions
 from sbi_active.mujoco import from_mjcf
 from tests.mujoco.machines import GAINS, held_arm, stepped
 
-TENDON = """
-<mujoco>
-  <option timestep="0.002"/>
-  <worldbody>
-    <body>
-      <joint name="hinge" axis="0 1 0" damping="0.1"/>
-      <geom type="capsule" fromto="0 0 0 0.4 0 0" size="0.02"/>
-      <body pos="0.4 0 0">
-        <joint name="slide" type="slide" axis="1 0 0" damping="1"/>
-        <geom size="0.05"/>
-      </body>
-    </body>
-  </worldbody>
-  <tendon>
-    <fixed name="strap" stiffness="1" damping="0.2" springlength="0.1">
-      <joint joint="hinge" coef="0.5"/>
-      <joint joint="slide" coef="-1"/>
-    </fixed>
-  </tendon>
-  <actuator>
-    <general name="motor" tendon="strap" dyntype="filter" dynprm="0.1" gainprm="3"/>
-  </actuator>
-  <sensor>
-    <jointpos joint="hinge"/>
-    <tendonpos tendon="strap"/>
-    <actuatorfrc actuator="motor"/>
-  </sensor>
-  <keyframe>
-    <key name="wound" qpos="0.3 -0.1" qvel="0 0.2" act="0.6"/>
-  </keyframe>
-</mujoco>
-"""
+TENDON = """<mujoco><option timestep="0.002"/><worldbody>
+<body><joint name="hinge" axis="0 1 0" damping="0.1"/>
+<geom type="capsule" fromto="0 0 0 0.4 0 0" size="0.02"/>
+<body pos="0.4 0 0"><joint name="slide" type="slide" axis="1 0 0" damping="1"/>
+<geom size="0.05"/></body></body></worldbody>
+<tendon><fixed name="strap" stiffness="1" damping="0.2" springlength="0.1">
+<joint joint="hinge" coef="0.5"/><joint joint="slide" coef="-1"/></fixed></tendon>
+<actuator><general name="motor" tendon="strap" dyntype="filter" dynprm="0.1"
+gainprm="3"/></actuator>
+<sensor><jointpos joint="hinge"/><tendonpos tendon="strap"/>
+<actuatorfrc actuator="motor"/></sensor>
+<keyframe><key name="wound" qpos="0.3 -0.1" qvel="0 0.2" act="0.6"/></keyframe>
+</mujoco>"""
 
 
 def held(name: str, **options) -> list[float]:

@@ -9,14 +9,7 @@ from sbi.utils import BoxUniform
 
 from sbi_active import GaussianNoise, SimulatorModel
 from sbi_active.criticism import Trials, close_loop, varying_parameters
-from sbi_active.criticism.effects.changes import (
-    delayed_input,
-    delayed_samples,
-    lagged_input,
-    lagged_samples,
-    played,
-    rounded,
-)
+from sbi_active.criticism.effects import changes
 from sbi_active.criticism.effects.first_samples import start_from_first_samples
 
 STEP = torch.tensor(0.1).double()
@@ -41,17 +34,17 @@ def test_a_lag_is_that_of_fine_integration():
                 path.append(y)
                 y += float(STEP) / fine * (value - y) / float(tau[row])
             means.append(np.mean([*path[1:], y]) / 2 + np.mean(path) / 2)
-        found = lagged_input(u[row : row + 1], tau[row : row + 1], STEP)
+        found = changes.lagged_input(u[row : row + 1], tau[row : row + 1], STEP)
         assert found[0].numpy() == pytest.approx(np.array(means), abs=2e-3)
 
 
 def test_a_delay_by_steps_shifts():
     u = random(2, 30)
-    found = delayed_input(u, column(0.2, 0.0), STEP)
+    found = changes.delayed_input(u, column(0.2, 0.0), STEP)
     assert torch.allclose(found[0, 2:], u[0, :-2])
     assert torch.equal(found[0, :2], u[0, :1].expand(2))
     assert torch.equal(found[1], u[1])
-    half = delayed_input(u, column(0.05, 0.05), STEP)
+    half = changes.delayed_input(u, column(0.05, 0.05), STEP)
     assert torch.allclose(half[:, 1:], (u[:, 1:] + u[:, :-1]) / 2)
 
 
@@ -64,7 +57,7 @@ def test_a_backlash_is_that_of_its_definition():
             torch.maximum(y, u[:, k] - width[:, 0] / 2), u[:, k] + width[:, 0] / 2
         )
         expected[:, k] = y
-    assert torch.equal(played(u, width), expected)
+    assert torch.equal(changes.played(u, width), expected)
     assert torch.equal(expected[0], u[0])
 
 
@@ -72,7 +65,7 @@ def test_a_backlash_is_that_of_its_definition():
 def test_a_sensor_s_lag_is_that_of_fine_integration(channels):
     times = torch.tensor([0.0, 0.1, 0.25, 0.3, 0.7, 1.0]).double()
     x, tau = random(2, 6, *channels), column(0.05, 0.4)
-    found = lagged_samples(x, tau, times.expand(2, -1))
+    found = changes.lagged_samples(x, tau, times.expand(2, -1))
     fine = np.linspace(0, 1, 10_001)
     for row in range(2):
         for c in np.ndindex(*channels):
@@ -87,7 +80,7 @@ def test_a_sensor_s_lag_is_that_of_fine_integration(channels):
             assert own == pytest.approx(expected, abs=4e-3)
     # Padding is no number, and costs none.
     padded = [torch.cat([v, v[:, -1:]], 1) for v in (x, times.expand(2, -1))]
-    longer = lagged_samples(padded[0], tau, padded[1])
+    longer = changes.lagged_samples(padded[0], tau, padded[1])
     assert torch.allclose(longer[:, :6], found)
     assert bool(longer.isfinite().all())
 
@@ -95,23 +88,23 @@ def test_a_sensor_s_lag_is_that_of_fine_integration(channels):
 def test_a_sensor_s_delay_reads_between_its_samples_and_a_quantum_rounds():
     times = torch.tensor([[0.0, 0.1, 0.3, 0.3, 0.3]]).double()  # padded
     x = torch.tensor([[1.0, 2.0, 4.0, 4.0, 4.0]]).double()
-    both = delayed_samples(torch.stack([x, -x], -1), column(0.05), times)
+    both = changes.delayed_samples(torch.stack([x, -x], -1), column(0.05), times)
     for channel, sign in ((0, 1), (1, -1)):
         found = sign * both[0, :3, channel]
         assert found.tolist() == pytest.approx([1.0, 1.5, 3.5])
-    assert torch.equal(delayed_samples(x, column(0.0), times), x)
+    assert torch.equal(changes.delayed_samples(x, column(0.0), times), x)
     x = torch.tensor([[0.12, -0.37]]).double()
-    assert rounded(x, column(0.1))[0].tolist() == pytest.approx([0.1, -0.4])
-    assert torch.equal(rounded(x, column(0.0)), x)
+    assert changes.rounded(x, column(0.1))[0].tolist() == pytest.approx([0.1, -0.4])
+    assert torch.equal(changes.rounded(x, column(0.0)), x)
 
 
 STEPS = 0.1 * torch.arange(50)[None].double()
 CHANGES = {
-    "input lag": lambda u, phi: lagged_input(u, phi, STEP),
-    "input delay": lambda u, phi: delayed_input(u, phi, STEP),
-    "backlash": played,
-    "sensor lag": lambda x, phi: lagged_samples(x, phi, STEPS),
-    "sensor delay": lambda x, phi: delayed_samples(x, phi, STEPS),
+    "input lag": lambda u, phi: changes.lagged_input(u, phi, STEP),
+    "input delay": lambda u, phi: changes.delayed_input(u, phi, STEP),
+    "backlash": changes.played,
+    "sensor lag": lambda x, phi: changes.lagged_samples(x, phi, STEPS),
+    "sensor delay": lambda x, phi: changes.delayed_samples(x, phi, STEPS),
 }
 
 

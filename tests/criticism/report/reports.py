@@ -8,19 +8,9 @@ import torch
 from sbi.utils import BoxUniform
 
 from sbi_active import DiscreteActions, GaussianNoise, SimulatorModel
-from sbi_active.criticism import Trials
+from sbi_active.criticism import Trials, results
 from sbi_active.criticism.contradictions import Misfit, ModelError, Support
 from sbi_active.criticism.report.report import build_report
-from sbi_active.criticism.results import (
-    Detection,
-    Estimate,
-    Evaluation,
-    Evidence,
-    ModelKey,
-    NextAction,
-    Residuals,
-    Tracing,
-)
 from tests.effects import on_outcomes
 
 DRAG = on_outcomes("drag", lambda x, phi, action, context: x - phi)
@@ -28,11 +18,11 @@ NAMES = ["drag", "tilt", "bias"]
 SHUFFLED = [2.0, -1.0, 3.0, 1.0, -2.0, -3.0, 1.5, -1.5, 2.5]
 
 
-def evidence(name: str, log_evidence: float) -> Evidence:
+def evidence(name: str, log_evidence: float) -> results.Evidence:
     rng = np.random.default_rng(0)
     names = ("mu_1", "mu_2") if name == "none" else ("mu_1", "mu_2", name)
-    return Evidence(
-        key=ModelKey.of(name),
+    return results.Evidence(
+        key=results.ModelKey.of(name),
         log_evidence=log_evidence,
         standard_error=0.05,
         effective_sample_size=312.0,
@@ -42,8 +32,8 @@ def evidence(name: str, log_evidence: float) -> Evidence:
     )
 
 
-def estimate(name: str, probability: float, **changes) -> Estimate:
-    made = Estimate(
+def estimate(name: str, probability: float, **changes) -> results.Estimate:
+    made = results.Estimate(
         name=name,
         family="dynamics",
         units="1/m",
@@ -57,11 +47,11 @@ def estimate(name: str, probability: float, **changes) -> Estimate:
     return replace(made, **changes)
 
 
-def tracing(verdict: str = "drag", **changes) -> Tracing:
+def tracing(verdict: str = "drag", **changes) -> results.Tracing:
     probabilities = {"none": 0.004, "unexplained": 0.01, "scatter": 0.001}
     probabilities |= {"drag": 0.81, "tilt": 0.125, "bias": 0.05}
     chosen = (verdict,) if verdict in NAMES else ()
-    made = Tracing(
+    made = results.Tracing(
         verdict=verdict,
         chosen=chosen,
         probabilities=probabilities,
@@ -98,10 +88,12 @@ def misfit(left_out, held_out=(None, None), *, named=(), sensor=(0.005,)) -> Mis
     )
 
 
-def residuals(shape=(6,), *, size: float = 1.0, num: int = 8, times=None) -> Residuals:
+def residuals(
+    shape=(6,), *, size: float = 1.0, num: int = 8, times=None
+) -> results.Residuals:
     rng = np.random.default_rng(1)
     z = size * rng.normal(size=(num, *shape))
-    return Residuals(
+    return results.Residuals(
         action=np.array(SHUFFLED[:num])[:, None],
         index=np.arange(num, dtype=float),
         times=times,
@@ -114,7 +106,7 @@ def residuals(shape=(6,), *, size: float = 1.0, num: int = 8, times=None) -> Res
     )
 
 
-def evaluation(num: int = 8) -> Evaluation:
+def evaluation(num: int = 8) -> results.Evaluation:
     rng = np.random.default_rng(2)
     before = {
         "rmse": 0.05 + 0.02 * rng.random(num),
@@ -122,21 +114,22 @@ def evaluation(num: int = 8) -> Evaluation:
         "log predictive density": -20 - 5 * rng.random(num),
         "coverage": np.round(rng.random(num) * 6) / 6,
     }
-    changed = {"rmse": (0.2, 0.0), "energy score": (0.25, 0.0), "coverage": (0.0, 0.8)}
-    after, rows = {}, []
-    for name, b in before.items():
-        times, more = changed.get(name, (1.0, 35.0))
-        after[name] = times * b + more
-        one, other = b.mean(), after[name].mean()
-        ratio = other - one if more else times
-        rows.append((name, one, other, ratio, 0.9 * ratio, 1.1 * ratio))
-    columns = pd.Index(["metric", "before", "after", "ratio", "low", "high"])
-    return Evaluation(
+    after = {
+        "rmse": 0.2 * before["rmse"],
+        "energy score": 0.25 * before["energy score"],
+        "log predictive density": before["log predictive density"] + 35,
+        "coverage": np.full(num, 0.8),
+    }
+    table = pd.DataFrame({"metric": [*before], "ratio": [0.2, 0.25, 35.0, 0.3]})
+    for name, scores in (("before", before), ("after", after)):
+        table[name] = [own.mean() for own in scores.values()]
+    table = table.assign(low=0.9 * table["ratio"], high=1.1 * table["ratio"])
+    return results.Evaluation(
         scheme="held out",
         trials=np.arange(num, dtype=float),
         before=before,
         after=after,
-        table=pd.DataFrame(rows, columns=columns),
+        table=table,
     )
 
 
@@ -150,7 +143,7 @@ def report(**changes):
         "trials": trials(),
         "residuals": residuals(size=6.0),
         "residuals_after": residuals(),
-        "detection": Detection(
+        "detection": results.Detection(
             log_bayes_factor=8.2,
             threshold=float(np.log(20)),
             chi_square=180.4,
@@ -161,7 +154,7 @@ def report(**changes):
         ),
         "tracing": tracing(),
         "evaluation": evaluation(),
-        "next_action": NextAction(
+        "next_action": results.NextAction(
             action=np.array([3.0]),
             candidates=np.array([[1.0], [3.0]]),
             information_gain=np.array([0.1, 0.41]),

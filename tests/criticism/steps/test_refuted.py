@@ -20,15 +20,7 @@ from tests.criticism.misfit.oscillator import EFFECTS, MODEL, PRIOR
 from tests.criticism.misfit.oscillator import trials as oscillations
 from tests.criticism.report.reports import misfit
 from tests.criticism.report.reports import tracing as reported
-from tests.criticism.steps.linear_world import (
-    ACTION,
-    NOISE,
-    columns,
-    judged,
-    measured,
-    posterior,
-    rivals,
-)
+from tests.criticism.steps import linear_world as world
 from tests.effects import autocorrelated
 
 # What a verdict rests on
@@ -86,8 +78,8 @@ def report_of(x, action=SPEEDS):
 
 @pytest.fixture(scope="module")
 def fitted():
-    some = rivals(measured(curve=0.5))
-    return traced(judged(some), None)
+    some = world.rivals(world.measured(curve=0.5))
+    return traced(world.judged(some), None)
 
 
 @pytest.mark.parametrize("drag", [0.0, 0.3])
@@ -107,7 +99,7 @@ def test_a_trial_in_another_unit_is_named_first(drag):
 
 def test_the_level_is_that_of_all_held_out_trials(fitted):
     tracing, some = fitted
-    trials = Trials(ACTION, measured(curve=0.5, seed=1))
+    trials = Trials(world.ACTION, world.measured(curve=0.5, seed=1))
     named = evaluate_held_out(some, tracing, trials, level=12 * 0.9).missed
     assert 6 <= len(named) <= 12
     assert [*named] == sorted(named, key=lambda trial: -trial.size)
@@ -151,10 +143,12 @@ def test_errors_under_misfit_are_compared_with_those_of_left_out_trials():
 
 def test_what_no_model_predicts_refutes_none(fitted):
     tracing, some = fitted
-    x = measured(curve=0.5, seed=1)
-    mean, _ = posterior(measured(curve=0.5), ("curve",))
-    x[0] += 1e4 if columns(("curve",))[0, 2] * mean[2] < 0 else -1e4  # nearer the bare
-    evaluation = evaluate_held_out(some, tracing, Trials(ACTION, x))
+    x = world.measured(curve=0.5, seed=1)
+    mean, _ = world.posterior(world.measured(curve=0.5), ("curve",))
+    x[0] += (
+        1e4 if world.columns(("curve",))[0, 2] * mean[2] < 0 else -1e4
+    )  # nearer the bare
+    evaluation = evaluate_held_out(some, tracing, Trials(world.ACTION, x))
     rmse = evaluation.table.set_index("metric").loc["rmse"]
     assert rmse["after"] > rmse["before"]
     assert [trial.position for trial in evaluation.missed if trial.by_both] == [0]
@@ -163,11 +157,11 @@ def test_what_no_model_predicts_refutes_none(fitted):
 
 def test_the_tail_is_that_of_the_normal_predictive(fitted):
     tracing, some = fitted
-    x = measured(curve=0.5, seed=1)
+    x = world.measured(curve=0.5, seed=1)
     x[5] = x[5] + 0.8
-    (missed,) = evaluate_held_out(some, tracing, Trials(ACTION, x)).missed
-    mean, covariance = posterior(measured(curve=0.5), ("curve",))
-    design = columns(("curve",))[5]
-    sd = np.sqrt(design @ covariance @ design + NOISE**2)
+    (missed,) = evaluate_held_out(some, tracing, Trials(world.ACTION, x)).missed
+    mean, covariance = world.posterior(world.measured(curve=0.5), ("curve",))
+    design = world.columns(("curve",))[5]
+    sd = np.sqrt(design @ covariance @ design + world.NOISE**2)
     z = abs(float(x[5]) - design @ mean) / sd
     assert np.log(missed.p_value) == pytest.approx(np.log(2 * norm.sf(z)), rel=0.2)

@@ -13,21 +13,12 @@ from sbi_active.criticism.misfit.record import traced
 from sbi_active.criticism.results import ModelKey
 from sbi_active.criticism.rivals.rival_set import RivalSet
 from sbi_active.criticism.steps.predictive import find_residuals
-from tests.criticism.steps import linear_world
-from tests.criticism.steps.linear_world import (
-    ACTION,
-    NOISE,
-    columns,
-    judged,
-    measured,
-    posterior,
-    rivals,
-)
+from tests.criticism.steps import linear_world as world
 from tests.effects import added
 
 
 def tracing_of(x):
-    found = judged(rivals(x))
+    found = world.judged(world.rivals(x))
     return traced(found, None)[0], found
 
 
@@ -37,11 +28,11 @@ def tracing_of(x):
     ids=" ".join,
 )
 def test_evidences_are_exact_and_what_they_say_is_chosen(phi):
-    x = measured(**phi)
-    found = judged(rivals(x))
+    x = world.measured(**phi)
+    found = world.judged(world.rivals(x))
     for key in found.choice.probabilities:
         # Beside the sensor's error alone, in densities of its deviations.
-        exact = linear_world.log_evidence(x, key.effects) + len(x) * np.log(NOISE)
+        exact = world.log_evidence(x, key.effects) + len(x) * np.log(world.NOISE)
         # There several effects have scales of their own.
         error = 0.2 + 0.5 * (len(key.effects) > 1)
         assert found.states.log_evidence(key) == pytest.approx(exact, abs=error)
@@ -53,11 +44,11 @@ def test_evidences_are_exact_and_what_they_say_is_chosen(phi):
 
 
 def test_estimates_are_those_of_each_effect_alone():
-    x = measured(curve=0.3)
+    x = world.measured(curve=0.3)
     tracing, found = tracing_of(x)
-    null = linear_world.log_evidence(x)
+    null = world.log_evidence(x)
     for estimate in tracing.estimates:
-        mean, covariance = posterior(x, (estimate.name,))
+        mean, covariance = world.posterior(x, (estimate.name,))
         sd = covariance[-1, -1] ** 0.5
         error = 4 * sd * np.sqrt(2 / 400)
         if found.misses(ModelKey((estimate.name,))):
@@ -66,7 +57,7 @@ def test_estimates_are_those_of_each_effect_alone():
         else:
             assert estimate.mean == pytest.approx(mean[-1:], abs=error)
             assert estimate.sd == pytest.approx([sd], abs=error)
-        factor = linear_world.log_evidence(x, (estimate.name,)) - null
+        factor = world.log_evidence(x, (estimate.name,)) - null
         assert estimate.log_bayes_factor == pytest.approx(factor, abs=0.3)
     shares = [estimate.probability for estimate in tracing.estimates]
     assert shares == sorted(shares, reverse=True)
@@ -74,7 +65,7 @@ def test_estimates_are_those_of_each_effect_alone():
 
 
 def test_without_an_alarm_there_is_nothing_to_trace():
-    tracing, _ = tracing_of(measured())
+    tracing, _ = tracing_of(world.measured())
     assert tracing.verdict == "none"
     assert tracing.chosen == tracing.needed == ()
     # No trial is suspected, and no set of several effects is looked for.
@@ -84,7 +75,7 @@ def test_without_an_alarm_there_is_nothing_to_trace():
 
 def test_what_an_effect_leaves_over_is_unexplained_beside_it():
     """A wave that nobody declared, whose error the intervals hold."""
-    x = measured(curve=1.0, further=0.4 * torch.sin(1.7 * ACTION + 1))
+    x = world.measured(curve=1.0, further=0.4 * torch.sin(1.7 * world.ACTION + 1))
     tracing, found = tracing_of(x)
     assert found.key.error in ("unexplained", "scatter")
     misfit = tracing.misfit
@@ -100,7 +91,7 @@ def test_what_an_effect_leaves_over_is_unexplained_beside_it():
 
 def test_a_formula_that_does_better_leaves_an_imitation_unnamed():
     """A power of 1.5 is not declared; the curve takes up 99 % of its excess."""
-    tracing, _ = tracing_of(measured(further=4 * ACTION.abs() ** 1.5))
+    tracing, _ = tracing_of(world.measured(further=4 * world.ACTION.abs() ** 1.5))
     misfit = tracing.misfit
     assert "curve" in misfit.helps
     assert misfit.support["curve"].remains < 0.02
@@ -113,14 +104,15 @@ def test_effects_that_the_trials_do_not_separate_count_as_one():
     twin = added("twin", lambda xi: 0.5 * (xi**2 - 1), family="dynamics")
     group = frozenset({"curve", "twin"})
     tracing, _ = traced(
-        judged(rivals(measured(curve=0.1, kink=0.28), twin), [group]), None
+        world.judged(world.rivals(world.measured(curve=0.1, kink=0.28), twin), [group]),
+        None,
     )
     assert tracing.equivalent == (group,)
     assert tracing.verdict == max(group, key=tracing.probabilities.__getitem__)
 
 
 def test_the_credible_set_has_nine_tenths_of_the_probability_and_no_more_names():
-    tracing, _ = tracing_of(measured(curve=0.14, kink=0.2))
+    tracing, _ = tracing_of(world.measured(curve=0.14, kink=0.2))
     p, num = tracing.probabilities, len(tracing.credible_set)
     least, less = (sum(sorted(p.values())[-k:]) for k in (num, num - 1))
     assert sum(p[n] for n in tracing.credible_set) == pytest.approx(least)
@@ -132,11 +124,13 @@ def test_the_credible_set_has_nine_tenths_of_the_probability_and_no_more_names()
 
 
 def test_a_name_may_contain_what_joins_names():
-    x = measured(curve=0.5, kink=0.6)
-    shapes = rivals(x).effects
+    x = world.measured(curve=0.5, kink=0.6)
+    shapes = world.rivals(x).effects
     renamed = [replace(e, name=f"{n} + {n} lag") for n, e in shapes.items()]
-    some = RivalSet(rivals(x).model, linear_world.PRIOR, Trials(ACTION, x), renamed)
-    tracing, _ = traced(judged(some), None)
+    some = RivalSet(
+        world.rivals(x).model, world.PRIOR, Trials(world.ACTION, x), renamed
+    )
+    tracing, _ = traced(world.judged(some), None)
     assert tracing.chosen == ("curve + curve lag", "kink + kink lag")
     assert tracing.model == "curve + curve lag + kink + kink lag"
     assert tracing.inclusion["wave + wave lag"] < 0.2
@@ -147,16 +141,16 @@ def test_a_name_may_contain_what_joins_names():
 # Residuals and scores on further trials, in closed form
 
 
-X = measured(curve=0.5)
-OTHERS = measured(curve=0.5, seed=1)
+X = world.measured(curve=0.5)
+OTHERS = world.measured(curve=0.5, seed=1)
 
 
 def predictive(x, names, known=slice(None)):
     """Return mean and deviation of a measurement at each of the twelve actions."""
-    mean, covariance = posterior(x, names, known)
-    design = columns(names)
+    mean, covariance = world.posterior(x, names, known)
+    design = world.columns(names)
     variance = np.einsum("ni,ij,nj->n", design, covariance, design)
-    return design @ mean, np.sqrt(variance + NOISE**2)
+    return design @ mean, np.sqrt(variance + world.NOISE**2)
 
 
 def norm_crps(x, mean, sd):
@@ -167,7 +161,7 @@ def norm_crps(x, mean, sd):
 
 @pytest.fixture(scope="module")
 def fitted():
-    return traced(judged(rivals(X)), None)
+    return traced(world.judged(world.rivals(X)), None)
 
 
 def check_scores(scores, own, mean, sd):
@@ -187,10 +181,10 @@ def test_scores_before_and_after_are_those_of_the_normal_predictives(fitted, sch
     tracing, some = fitted
     own = OTHERS if scheme == "held out" else X
     if scheme == "held out":
-        made = evaluate_held_out(some, tracing, Trials(ACTION, own))
+        made = evaluate_held_out(some, tracing, Trials(world.ACTION, own))
     else:
-        found = judged(rivals(X))
-        trials = Trials(ACTION, own)
+        found = world.judged(world.rivals(X))
+        trials = Trials(world.ACTION, own)
         made = evaluate_left_out(found, found.rivals, trials, num_draws=2000)
     for scores, names in ((made.before, ()), (made.after, ("curve",))):
         mean, sd = predictive(X, names)
@@ -204,9 +198,11 @@ def test_scores_before_and_after_are_those_of_the_normal_predictives(fitted, sch
 
 def test_errors_of_some_trials_are_those_of_a_verdict_on_them():
     """A smooth function of the action is one of them; without it scatter took over."""
-    x, keep = measured(curve=0.1), np.arange(12) != 4
-    whole = judged(rivals(x)).states.joint(ModelKey(), keep)
-    part = judged(rivals(x[keep], action=ACTION[keep])).states.joint(ModelKey())
+    x, keep = world.measured(curve=0.1), np.arange(12) != 4
+    whole = world.judged(world.rivals(x)).states.joint(ModelKey(), keep)
+    part = world.judged(world.rivals(x[keep], action=world.ACTION[keep])).states.joint(
+        ModelKey()
+    )
     assert [*whole] == [*part]
     for key, log_p in part.items():
         assert whole[key] == pytest.approx(log_p, abs=0.3), key
@@ -230,10 +226,10 @@ def test_residuals_are_standardized_by_the_normal_predictive(fitted, names):
 def test_intervals_of_a_model_that_misses_know_it(phi):
     """Whichever model explains: its posterior beside the sensor's error does not."""
     noise = torch.randn(12, 1, generator=torch.Generator().manual_seed(1))
-    x = measured(further=0.0 if phi else 4 * NOISE * noise, **phi)
+    x = world.measured(further=0.0 if phi else 4 * world.NOISE * noise, **phi)
     tracing, found = tracing_of(x)
     assert tracing.verdict == " ".join(phi) or found.key.error == "scatter"
-    mean, covariance = linear_world.posterior(x, ())
+    mean, covariance = world.posterior(x, ())
     draws = tracing.evidences["none"].draws
     assert (draws.std(0) > 2 * np.sqrt(np.diag(covariance))).all()
     assert tracing.evidences["none"].best == pytest.approx(mean, abs=0.02)
