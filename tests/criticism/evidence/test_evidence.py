@@ -143,15 +143,6 @@ def test_a_random_simulator_gives_its_own_probability_of_an_outcome():
 # Nuisances of each trial
 
 
-def test_masked_numbers_are_left_out():
-    def two(theta, action):
-        return line(theta, action).repeat(1, 2)
-
-    x = torch.cat([X, torch.full_like(X, torch.nan)], 1)
-    x[3] = x[3].flip(0)
-    require_evidence(rivals(two, Trials(ACTION, x)), exact(ACTION, X[:, 0]))
-
-
 def test_a_nuisance_of_each_trial_is_integrated_out_and_drawn_for_another():
     models = rivals(line, Trials(ACTION, X), [START])
     evidence = exact(ACTION, X[:, 0], extra=0.8)

@@ -55,23 +55,6 @@ def test_filters_whiten_by_the_dense_covariance(measurements):
             assert found.log_det[k, g] == pytest.approx(log_det, rel=1e-6, abs=1e-8)
 
 
-def test_series_are_whitened_side_by_side():
-    rng = np.random.default_rng(3)
-    time, series = np.sort(rng.uniform(0, 2, 25)), rng.standard_normal((2, 25, 3))
-    process, smooth = np.array([0.1, 2.0]), np.array([False, True])
-    own = Processes(np.array([0.2, 1.0]), process, np.array([0.3, 0.8]), smooth)
-    both = Filter(own, time)
-    found = both.grams(series)
-    white = both.whitened(series)
-    for k in range(2):
-        dense = covariance(time, own, k, process[k])
-        assert both.log_det[k] == pytest.approx(np.linalg.slogdet(dense)[1])
-        for s in range(2):
-            gram = series[s].T @ np.linalg.solve(dense, series[s])
-            assert found[k, s] == pytest.approx(gram)
-            assert white[k, s].T @ white[k, s] == pytest.approx(gram)
-
-
 def test_long_series_are_filtered_piece_by_piece(measurements):
     m = measurements
     rows = np.random.default_rng(2).standard_normal((1, 60, 2))

@@ -19,11 +19,13 @@ EFFECTS = [
 ]
 
 
-def oscillate(theta, action, *, cubic=0.0, friction=0.0, lag=0.0, bias=0.0, hidden=0.0):
+def oscillate(
+    theta, action, *, cubic=0.0, friction=0.0, lag=0.0, bias=0.0, hidden=0.0, start=0.0
+):
     """Return positions at the sample times of x'' = -k x - c x' + u sin 2t, (n, k)."""
     k, c = theta.T.double()
     u = action[:, 0].double()
-    x, v = torch.zeros_like(k), torch.zeros_like(k)
+    x, v = start + torch.zeros_like(k), torch.zeros_like(k)
     dt, found = 0.2, []
     for i in range(NUM_SAMPLES):
         drive = u * torch.sin(torch.tensor(2 * dt * i, dtype=torch.float64))
