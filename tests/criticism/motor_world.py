@@ -66,13 +66,13 @@ def played(num, seed):
     return levels.repeat_interleave(10, 1)[:, : len(GRID)]
 
 
-def measured(seed, phi, *, num=8, held_out=2):
+def measured(seed, phi, *, num=8, held_out=2, library=LIBRARY):
     """Trials of a motor with some effects, sampled off the voltage's grid."""
     total = num + held_out
     voltage = played(total, seed)
     start = {"speed": torch.linspace(-1, 1, total).double()}
     times = 0.05 + 0.1 * torch.arange(19).double()
-    real = AugmentedSimulator(MODEL, LIBRARY)
+    real = AugmentedSimulator(MODEL, library)
     x = real.evaluate(
         torch.tensor([[3.0, 0.3]]).double().expand(total, -1),
         {k: torch.full((total, 1), v).double() for k, v in phi.items()},

@@ -86,18 +86,6 @@ def sampling(every, step=1.0):
     return Sampling(step=step, every=every, before=0.9, after=0.1)
 
 
-def test_thinning_masks_and_changes_nothing_else():
-    x = torch.arange(24.0).reshape(2, 6, 2)
-    given = {"sample_times": torch.arange(6.0), "names": ["a", "b"]}
-    trials = Trials([1.0, 2.0], x, role=["fit", "held out"], **given)
-    few = thinned(trials, sampling(3))
-    assert few.mask[0, :, 0].tolist() == [False, False, True, False, False, True]
-    assert few.x[1, 5].tolist() == [22, 23]
-    assert torch.equal(few.sample_times, trials.sample_times)
-    assert (few.names, few.role) == (trials.names, trials.role)
-    assert trials.mask.all()
-
-
 def test_channels_of_other_rates_and_short_trials_keep_their_own():
     x = torch.full((2, 12, 2), torch.nan)
     x[0, :, 0] = 1.0

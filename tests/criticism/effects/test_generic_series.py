@@ -6,39 +6,16 @@ from sbi.utils import BoxUniform
 
 from sbi_active import GaussianNoise, SimulatorModel
 from sbi_active.criticism import Criticism, Trials, generic_effects
-from sbi_active.criticism.effects.changes import delayed_input, played
-from tests.criticism.motor_world import GRID, MODEL, NOISE, PRIOR, measured, speed
+from tests.criticism.motor_world import MODEL, PRIOR, measured
 
 
-def distorted(change):
-    """Trials of a motor whose voltage is changed before it acts."""
-    trials = measured(0, {}, num=5, held_out=0)
-    rows, given = len(trials), {"input_times": GRID, "start": trials.start}
-    x = speed(
-        torch.tensor([[3.0, 0.3]]).double().expand(rows, -1),
-        trials.action,
-        inputs={"voltage": change(trials.inputs["voltage"])},
-        times=trials.sample_times.expand(rows, -1),
-        **given,
-    )
-    gen = torch.Generator().manual_seed(5)
-    x = x + NOISE * torch.randn(x.shape, generator=gen).double()
-    given |= {"sample_times": trials.sample_times, "inputs": trials.inputs}
-    return Trials(None, x, **given)
-
-
-CHANGES = {
-    "input delay": lambda u: delayed_input(u, torch.full((len(u), 1), 0.07), 0.02),
-    "backlash": lambda u: played(u, torch.full((len(u), 1), 0.5).double()),
-}
-
-
-@pytest.mark.parametrize("name", CHANGES)
-def test_what_an_actuator_does_is_found(name):
-    trials = distorted(CHANGES[name])
-    rivals = {"input gain", "input lag", *CHANGES}
-    effects = generic_effects(MODEL, trials, prior=PRIOR)
+@pytest.mark.parametrize(("name", "size"), [("input delay", 0.07), ("backlash", 0.5)])
+def test_what_an_actuator_does_is_found(name, size):
+    given = {"num": 5, "held_out": 0}
+    rivals = {"input gain", "input lag", "input delay", "backlash"}
+    effects = generic_effects(MODEL, measured(0, {}, **given), prior=PRIOR)
     effects = [effect for effect in effects if effect.name in rivals]
+    trials = measured(0, {name: size}, **given, library=effects)
     tracing = Criticism(MODEL, PRIOR, trials, effects=effects).trace()
     named = {part for g in tracing.equivalent if name in g for part in g}
     assert tracing.verdict in {name} | named

@@ -1,4 +1,4 @@
-"""Where fits of sets of effects begin."""
+"""Where fits of sets of effects begin, in libraries of any size."""
 
 import numpy as np
 import torch
@@ -10,7 +10,9 @@ from sbi_active.criticism import Criticism, Trials
 from sbi_active.criticism.linear.fits import FitSettings
 from sbi_active.criticism.linear.search import Search
 from sbi_active.criticism.results import ModelKey
-from tests.effects import on_outcomes
+from sbi_active.criticism.steps.detection import log_priors
+from sbi_active.criticism.steps.equivalence import MANY
+from tests.effects import louder, on_outcomes
 
 SENSOR, NUM_TRIALS, LIMIT, SLOPE = 0.5, 14, 14.0, 2.0
 
@@ -59,3 +61,51 @@ def test_no_pair_is_fitted_where_linear_evidence_puts_all_behind():
     search = searched(behind=-np.inf)
     search.fit_larger()
     assert max(len(key.effects) for key in search.found) == 1
+
+
+# A library of 24 effects, all fitted, and one of 25, screened, say the same
+
+
+TIMES = torch.linspace(0, 2, 30)
+PRIOR = BoxUniform(torch.tensor([-2.0]), torch.tensor([2.0]))
+
+
+def series(theta, action):
+    return theta * action * TIMES
+
+
+def pattern(k):
+    wave = (torch.cos, torch.sin)[k % 2](3 * (1 + k // 2) * TIMES)
+    apply = lambda x, phi, action, context: x + phi * wave  # noqa: E731
+    return on_outcomes(f"wave {k}", apply, 0.3, family="wave")
+
+
+def loop_of(number, strength, *more):
+    rng = np.random.default_rng(7)
+    model = SimulatorModel(series, noise=GaussianNoise(0.05))
+    action = torch.tensor([[0.5], [1.0], [1.5]])
+    x = series(torch.tensor([[0.7]]), action) + strength * torch.cos(6 * TIMES)
+    x = x + 0.05 * torch.from_numpy(rng.standard_normal(x.shape)).float()
+    effects = [*map(pattern, range(number)), *more]
+    return Criticism(model, PRIOR, Trials(action, x), effects=effects, seed=0)
+
+
+def test_clean_trials_of_many_effects_say_none():
+    assert loop_of(MANY + 1, 0.0).trace().verdict == "none"
+
+
+def test_one_effect_more_does_not_change_the_verdict():
+    few, many = (loop_of(MANY + k, 0.2).trace() for k in (0, 1))
+    assert few.verdict == many.verdict == "wave 2"
+    assert abs(few.inclusion["wave 2"] - many.inclusion["wave 2"]) < 0.1
+
+
+def test_what_was_set_aside_counts_in_the_prior_and_is_said():
+    loop = loop_of(MANY + 6, 0.2, louder())
+    report = loop.report(evaluate=False, plan=False)
+    assert len(loop.rivals.effects) < len(loop.effects)
+    assert "SA527" in [w.code for w in report.warnings]
+    assert log_priors(loop.rivals.library) == log_priors(loop.effects)
+    gone = next(iter(loop.screening.behind))
+    assert loop.add([gone])[1].event_shape[0] == 2  # can be added all the same
+    assert "louder" in loop.screening.kept  # of which no column tells
