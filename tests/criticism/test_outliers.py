@@ -8,6 +8,7 @@ from torch.distributions import Independent, Normal
 from sbi_active import DiscreteActions, GaussianNoise, SimulatorModel, StudentTNoise
 from sbi_active.criticism import Criticism, Effect, Trials
 from sbi_active.criticism.steps.detection import credible_set
+from tests.criticism.misfit import oscillator
 
 PRIOR = BoxUniform(-5 * torch.ones(2), 5 * torch.ones(2))
 ACTIONS = DiscreteActions(torch.arange(-5, 5.5, 0.5))
@@ -58,19 +59,9 @@ def test_a_gross_error_is_named_by_the_trial_s_own_index(size):
 
 @pytest.mark.parametrize(("num", "wrong"), [(4, 0), (8, 5)])
 def test_a_slip_along_a_trajectory_is_an_outlier_and_no_process(num, wrong):
-    times = torch.linspace(0.1, 1, 12)
-
-    def path(theta, action):
-        return theta[:, :1] * action * times + theta[:, 1:] * times**2
-
-    model = SimulatorModel(path, noise=GaussianNoise(0.05), sample_times=times)
-    gen = torch.Generator().manual_seed(0)
-    xi = torch.linspace(-2, 2, num)
-    x = path(torch.tensor([[1.0, 2.0]]).expand(num, -1), xi[:, None])
-    x = x + 0.05 * torch.randn(x.shape, generator=gen)
-    x[wrong] = x[wrong] / 100  # metres for centimetres
-    trials = Trials(xi, x, sample_times=times)
-    found = Criticism(model, PRIOR, trials).trace()
+    own = oscillator.trials(action=oscillator.ACTION[:num])
+    own.x[wrong] /= 100  # metres for centimetres
+    found = Criticism(oscillator.MODEL, oscillator.PRIOR, own).trace()
     assert found.verdict == "outlier"
     assert credible_set(found.outliers) == (float(wrong),)
 
@@ -111,16 +102,10 @@ def test_noise_declared_too_large_is_seen(noise):
 
 
 def test_noise_declared_too_large_is_seen_along_trajectories():
-    times = torch.linspace(0, 1, 12)
-    line = SimulatorModel(
-        lambda theta, xi: theta[:, :1] * times,
-        noise=GaussianNoise(10.0),
-        sample_times=times,
-    )
-    prior = BoxUniform(-torch.ones(1), torch.ones(1))
-    x = 0.5 * times + 0.1 * torch.randn(4, 12, generator=torch.manual_seed(0))
-    trials = Trials(torch.arange(4.0), x, sample_times=times)
-    assert Criticism(line, prior, trials).detect().lower_p_value < 1e-4
+    noise, times = GaussianNoise(100 * oscillator.SENSOR), oscillator.TIMES
+    model = SimulatorModel(oscillator.oscillate, noise=noise, sample_times=times)
+    found = Criticism(model, oscillator.PRIOR, oscillator.trials()).detect()
+    assert found.lower_p_value < 1e-4
 
 
 def test_held_out_trials_refute_an_alias():

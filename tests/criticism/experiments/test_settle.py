@@ -16,6 +16,7 @@ from sbi_active.criticism.experiments.choice import (
     unless_unproven,
 )
 from sbi_active.criticism.experiments.settle import NAME, VerdictError, settle
+from tests.criticism.misfit import oscillator
 from tests.effects import added
 
 NOISE = 0.1
@@ -116,31 +117,19 @@ def test_a_registered_prediction_is_that_of_linear_least_squares():
     assert own.bare[0] == pytest.approx(bare, abs=0.02)
 
 
-TIMES = torch.linspace(0.1, 3.0, 30)
-WAVE = SimulatorModel(
-    lambda theta, xi: xi * torch.sin(theta * TIMES),
-    noise=GaussianNoise(0.01),
-    sample_times=TIMES,
-)
-
-
 def test_no_effect_is_named_whose_predictions_did_not_hold():
-    gen = torch.Generator().manual_seed(0)
-    action = torch.linspace(1, 3, 9)[:, None]
-    phase = 6.28 * torch.rand((9, 1), generator=gen, dtype=torch.float64)
-    x = action * torch.sin(1.5 * TIMES) + 0.1 * torch.sin(2 * TIMES + phase) + 0.5
-    x = x + 0.01 * torch.randn(x.shape, generator=gen)
+    action = torch.linspace(0.5, 2.0, 9, dtype=torch.float64)[:, None]
+    every = oscillator.trials(action=action, lag=0.3, hidden=0.6)
     report = close_loop(
-        *(WAVE, BoxUniform(torch.tensor([0.5]), torch.tensor([2.5]))),
-        Trials(action[:8], x[:8], sample_times=TIMES),
-        effects=[added("bias", torch.ones_like)],
+        *(oscillator.MODEL, oscillator.PRIOR, every[:8]),
+        effects=oscillator.EFFECTS[2:3],
         actions=DiscreteActions(action[8:]),
-        real_system=lambda action: x[8],
+        real_system=lambda action: every.x[8],
         max_trials=1,
         evaluate=False,
     )
     (trial,) = report.tested
-    assert report.tracing.misfit.named == trial.registered.effects == ("bias",)
+    assert report.tracing.misfit.named == trial.registered.effects == ("lag",)
     assert trial.held
     assert unless_unproven(report, [trial]) is report
     failed = replace(trial, registered=replace(trial.registered, limit=0.0))
@@ -148,7 +137,7 @@ def test_no_effect_is_named_whose_predictions_did_not_hold():
     assert unless_unproven(report, [failed, trial, failed]).verdict == "unexplained"
     others = replace(trial, registered=replace(trial.registered, effects=()))
     found = unless_unproven(report, [others])
-    assert (found.verdict, found.tracing.beside) == ("unexplained", ("bias",))
+    assert (found.verdict, found.tracing.beside) == ("unexplained", ("lag",))
     assert found.tracing.key == report.tracing.key  # it still predicts
     assert probability_of(found) == 0.0
     assert found.warnings[-1].code == "SA533"
