@@ -311,18 +311,14 @@ def test_small_matrices_are_not_shared_by_threads():
     """A second thread spins: it made three of four CPU seconds of a robot's belief."""
     before, seen = torch.get_num_threads(), []
 
-    def decay(theta, action):
+    def watched(theta, action):
         seen.append(torch.get_num_threads())
-        return action * torch.exp(-theta * torch.arange(20) / 10)
+        return mean(theta, action)
 
-    model = SimulatorModel(decay, sample_times=torch.arange(20) / 10)
-    action = torch.tensor([[1.0], [2.0], [3.0]])
-    x = decay(torch.full((3, 1), 0.5), action) + 0.01 * torch.randn(3, 20)
-    seen.clear()
-    prior = BoxUniform(torch.zeros(1), torch.ones(1))
+    trials = Trials(ACTION, recorded())
     torch.set_num_threads(2)
     try:
-        identify(model, prior, Trials(action, x))
+        identify(model(fn=watched), PRIOR, trials)
         assert {*seen} == {1}
         assert torch.get_num_threads() == 2
     finally:

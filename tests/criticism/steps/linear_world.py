@@ -14,11 +14,13 @@ from sbi_active.criticism.linear.mixture import WIDTHS
 from sbi_active.criticism.linear.screening import linear_models
 from sbi_active.criticism.misfit.verdict import Verdict, judge
 from sbi_active.criticism.rivals.rival_set import RivalSet
+from sbi_active.simulation import NoiseModel
 from tests.effects import added
 
 ACTION = torch.linspace(-2, 2, 12)[:, None]
 XI = ACTION[:, 0].double().numpy()
 NOISE = 0.1
+SENSOR = GaussianNoise(NOISE)
 PRIOR = Independent(Normal(torch.zeros(2), torch.ones(2)), 1)
 SHAPES = {
     "curve": lambda xi: xi**2 - 1,
@@ -40,11 +42,13 @@ def measured(*, seed: int = 0, further: torch.Tensor | float = 0.0, **phi: float
 
 
 def rivals(
-    x: torch.Tensor, *further: Effect, action: torch.Tensor = ACTION
+    x: torch.Tensor,
+    *further: Effect,
+    action: torch.Tensor = ACTION,
+    noise: NoiseModel = SENSOR,
 ) -> RivalSet:
     model = SimulatorModel(
-        lambda theta, action: theta[:, :1] + theta[:, 1:] * action,
-        noise=GaussianNoise(NOISE),
+        lambda theta, action: theta[:, :1] + theta[:, 1:] * action, noise=noise
     )
     effects = [*map(effect, SHAPES), *further]
     return RivalSet(model, PRIOR, Trials(action, x), effects)

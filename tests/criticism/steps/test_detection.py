@@ -10,43 +10,28 @@ from sbi_active import DiscreteActions, GaussianNoise, SimulatorModel, StudentTN
 from sbi_active.criticism import Criticism, Effect, Trials
 from sbi_active.criticism.steps.detection import LEVEL
 from sbi_active.simulation import estimate_noise
+from tests.criticism.steps import linear_world as world
 from tests.effects import effect, half, normal, on_outcomes
 
-NOISE = 0.1
-PRIOR = BoxUniform(-3 * torch.ones(2), 3 * torch.ones(2))
-CUBIC = on_outcomes("cubic", lambda x, phi, action, context: x + phi * action**3)
 
-
-def line(theta, action):
-    return theta[:, :1] + theta[:, 1:] * action
-
-
-def criticism(size=None, *, seed=0, noise=None):
-    """Of a residual that no declared effect takes up, along the actions, or none."""
-    action = torch.linspace(-2, 2, 8)[:, None]
-    x = (size or 0.0) * NOISE * torch.tensor([1.0, -1.0] * 4)[:, None]
-    if size is None:
-        gen = torch.Generator().manual_seed(seed)
-        action = 4 * torch.rand(8, 1, generator=gen) - 2
-        theta = 2 * torch.rand(1, 2, generator=gen) - 1
-        x = line(theta, action) + NOISE * torch.randn(8, 1, generator=gen)
-    model = SimulatorModel(line, noise=noise or GaussianNoise(NOISE))
-    return Criticism(model, PRIOR, Trials(action, x), effects=[CUBIC])
+def detected(x, noise=world.SENSOR):
+    return world.judged(world.rivals(x, noise=noise)).detection
 
 
 def test_the_chi_square_alone_raises_the_alarm_where_the_noise_is_known():
-    found = criticism(1.7).detect()
+    signs = torch.tensor([1.0, -1.0] * 6)[:, None]  # no effect takes these up
+    x = 0.8 * world.ACTION + 1.5 * world.NOISE * signs
+    found = detected(x)
     assert found.p_value < LEVEL
     assert not found.by_evidence
     assert found.alarm
-    repeats = NOISE * torch.randn(6, 1, generator=torch.Generator().manual_seed(0))
-    for noise in (estimate_noise(repeats), StudentTNoise(NOISE, df=4.0)):
-        assert criticism(1.7, noise=noise).detect().level == 0.0
+    repeats = 0.1 * torch.randn(6, 1, generator=torch.Generator().manual_seed(0))
+    for noise in (estimate_noise(repeats), StudentTNoise(0.1, df=4.0)):
+        assert detected(x, noise).level == 0.0
 
 
-@pytest.mark.slow
 def test_the_chi_square_of_clean_data_is_one():
-    p = [criticism(seed=seed).detect().p_value for seed in range(24)]
+    p = [detected(world.measured(seed=seed)).p_value for seed in range(24)]
     assert kstest(p, "uniform").pvalue > 0.01
 
 
