@@ -53,15 +53,13 @@ def payload(text):
     )
 
 
-def sequences(text=SPRING_MASS, name="bare", num=2, spring=True):
-    if not spring:
-        text = text.replace('stiffness="20" damping="0.5"', "")
+def sequences(text=SPRING_MASS, name="bare"):
     spec = mujoco.MjSpec.from_string(text)
     model = spec.compile()
     data = mujoco.MjData(model)
     t = np.arange(0, 1.0, 0.01)
     starts, controls, readings = [], [], []
-    for k in range(num):
+    for k in range(2):
         control = np.sin((4 + k) * t)[:, None]
         data.qpos[:] = 0.05 * k
         start = sysid.create_initial_state(model, data.qpos, data.qvel, data.act)
@@ -75,7 +73,7 @@ def sequences(text=SPRING_MASS, name="bare", num=2, spring=True):
                 state[0, ::3, 0], sensor[0, ::3].copy(), model, None
             )
         )
-    names = [f"{name} {k}" for k in range(num)]
+    names = [f"{name} {k}" for k in range(2)]
     return sysid.ModelSequences(name, spec, names, starts, controls, readings)
 
 

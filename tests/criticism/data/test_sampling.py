@@ -82,17 +82,13 @@ def test_gaps_several_channels_and_ragged_trials():
     assert suggested(by_model, x, times).every <= 13
 
 
-def sampling(every, step=1.0):
-    return Sampling(step=step, every=every, before=0.9, after=0.1)
-
-
 def test_channels_of_other_rates_and_short_trials_keep_their_own():
     x = torch.full((2, 12, 2), torch.nan)
     x[0, :, 0] = 1.0
     x[0, 1::4, 1] = 2.0  # a slow sensor, between the other's samples
     x[1, :2] = 3.0  # a trial that ended early
     trials = Trials([1.0, 2.0], x, sample_times=torch.arange(12.0))
-    few = thinned(trials, sampling(3)).mask
+    few = thinned(trials, Sampling(step=1.0, every=3, before=0.9, after=0.1)).mask
     assert few[0, :, 0].nonzero()[:, 0].tolist() == [2, 5, 8, 11]
     assert few[0, :, 1].nonzero()[:, 0].tolist() == [5, 9]
     assert few[1].nonzero()[:, 0].tolist() == [1, 1]

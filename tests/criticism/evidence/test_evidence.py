@@ -171,16 +171,12 @@ def grow(theta, action, times=None):
 def test_a_simulator_is_asked_for_the_times_of_each_trial():
     theta = torch.tensor([[1.5, -0.4], [0.7, 0.2]])
     action = torch.tensor([[1.0], [2.0]])
-    rows = [
-        [grow(own[None], action[i : i + 1], t)[0] for i, t in enumerate(TIMES)]
-        for own in theta
-    ]
-    trials = Trials(action, rows[0], sample_times=TIMES)
+    rows = [grow(theta, a, t) for a, t in zip(action, TIMES, strict=True)]
+    trials = Trials(action, [own[0] for own in rows], sample_times=TIMES)
     model = AugmentedSimulator(SimulatorModel(grow, noise=GaussianNoise(0.1)), [])
     simulator = TrialSimulator(model, trials)
     mean, _, _ = simulator.predict(theta, {})
-    expected = torch.stack([torch.cat(own) for own in rows])
-    np.testing.assert_allclose(mean, expected, atol=1e-6)
+    np.testing.assert_allclose(mean, torch.cat(rows, 1), atol=1e-6)
     assert simulator.measurements.has_time
 
 

@@ -38,8 +38,8 @@ def measured(bias=0.0, seed=0):
     return curve(theta, ACTION) + bias + SD * noise.double()
 
 
-def verdict_of(model, x, prior=PRIOR):
-    some = RivalSet(model, prior, Trials(ACTION, x), EFFECTS, seed=0)
+def verdict_of(model, x):
+    some = RivalSet(model, PRIOR, Trials(ACTION, x), EFFECTS, seed=0)
     return judge(linear_models(some)[0])
 
 

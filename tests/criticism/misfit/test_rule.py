@@ -199,18 +199,10 @@ def test_the_probability_of_a_better_prediction_is_that_of_a_t_test():
 # Weights of models by their errors on left-out trials
 
 
-def weights(*errors, log_prior=0.0):
-    """Return weights of models by their errors, and a prior of the first."""
-    keys = [ModelKey((str(k),)) for k in range(len(errors))]
-    prior = dict.fromkeys(keys, 0.0) | {keys[0]: log_prior}
-    error = {k: np.array(e, float) for k, e in zip(keys, errors, strict=True)}
-    found = weights_by_error(error, prior, seed=0)
-    assert sum(found.values()) == pytest.approx(1.0)
-    return [found[key] for key in keys]
-
-
 def test_no_model_wins_by_one_part_alone():
     """At the errors' mean the weight would be 1 / (1 + 1.9^-3.5) = .90."""
-    bare, one = [1.0] * 6 + [8.0], [1.05] * 6 + [1.0]
-    of_the_mean = 1 / (1 + (np.mean(one) / np.mean(bare)) ** 3.5)
-    assert 0.5 < weights(bare, one)[1] < of_the_mean - 0.05
+    bare, one = np.array([1.0] * 6 + [8.0]), np.array([1.05] * 6 + [1.0])
+    errors = {ModelKey(): bare, ModelKey(("a",)): one}
+    found = weights_by_error(errors, dict.fromkeys(errors, 0.0), seed=0)
+    of_the_mean = 1 / (1 + (one.mean() / bare.mean()) ** 3.5)
+    assert 0.5 < found[ModelKey(("a",))] < of_the_mean - 0.05

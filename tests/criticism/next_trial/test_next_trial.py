@@ -28,13 +28,12 @@ TILT = on_outcomes("tilt", lambda x, phi, action, context: x + phi * action.abs(
 GAIN = on_outcomes("gain", lambda x, phi, action, context: x * (1 + phi))
 
 
-def criticism(action, x, effects, actions, fn=MODEL.fn):
+def criticism(action, x, effects, actions):
     gen = torch.Generator().manual_seed(0)
     action = torch.tensor(action)
     x = torch.as_tensor(x) + NOISE * torch.randn(len(action), generator=gen)
-    model = SimulatorModel(fn, noise=GaussianNoise(NOISE))
     trials = Trials(action, x)
-    return Criticism(model, PRIOR, trials, effects=effects, actions=actions, seed=0)
+    return Criticism(MODEL, PRIOR, trials, effects=effects, actions=actions, seed=0)
 
 
 def only(c, *names):

@@ -64,7 +64,7 @@ def tracing(verdict: str = "drag", **changes) -> results.Tracing:
     return replace(made, **changes)
 
 
-def misfit(left_out, held_out=(None, None), *, named=(), sensor=(0.005,)) -> Misfit:
+def misfit(left_out, held_out=(None, None), *, sensor=(0.005,)) -> Misfit:
     """Return models that miss, by errors of the bare one and of that with drag."""
     models = tuple(
         ModelError(
@@ -79,7 +79,7 @@ def misfit(left_out, held_out=(None, None), *, named=(), sensor=(0.005,)) -> Mis
     return Misfit(
         models=models,
         helps=("drag",),
-        named=named,
+        named=(),
         support={"drag": Support(inclusion=0.9, better=0.9, gained=9.0, remains=0.9)},
         sensor=np.array(sensor),
         passes=False,

@@ -21,15 +21,15 @@ MODEL = SimulatorModel(
 ACTIONS = DiscreteActions(torch.linspace(-2, 2, 9))
 
 
-def decided(form, *, model=MODEL, prior=PRIOR, fitted=9, held_out=4, seed=0):
+def decided(form, *, prior=PRIOR, fitted=9, held_out=4):
     """Return the gate of trials whose mean is a form of the action and its place."""
-    gen = torch.Generator().manual_seed(seed)
+    gen = torch.Generator().manual_seed(0)
     num = fitted + held_out
     action = ACTIONS.values[torch.randperm(9, generator=gen).repeat(2)[:num]]
     mean = form(action, torch.arange(num)[:, None] < fitted)
     x = mean + NOISE * torch.randn(mean.shape, generator=gen)
     trials = Trials(action, x, role=["fit"] * fitted + ["held out"] * held_out)
-    report = close_loop(model, prior, trials, effects=[BIAS], plan=False)
+    report = close_loop(MODEL, prior, trials, effects=[BIAS], plan=False)
     assert report.to_dict()["gate"] == json.loads(json.dumps(report.gate.to_dict()))
     assert report.gate.exit_code == EXIT_CODES[report.gate.decision]
     return report.gate
