@@ -3,19 +3,12 @@
 import mujoco
 import numpy as np
 
-BALL = """
-<mujoco model="bouncing ball">
-  <option timestep="0.002"/>
-  <worldbody>
-    <geom name="floor" type="plane" size="1 1 .1"/>
-    <body name="ball" pos="0 0 .3">
-      <joint name="height" type="slide" axis="0 0 1"/>
-      <geom name="skin" type="sphere" size=".05" mass=".1" solref=".02 .2"/>
-    </body>
-  </worldbody>
-  <sensor><jointpos name="height" joint="height" noise=".001"/></sensor>
-</mujoco>
-"""
+BALL = """<mujoco model="bouncing ball"><option timestep="0.002"/><worldbody>
+<geom name="floor" type="plane" size="1 1 .1"/>
+<body name="ball" pos="0 0 .3"><joint name="height" type="slide" axis="0 0 1"/>
+<geom name="skin" type="sphere" size=".05" mass=".1" solref=".02 .2"/></body>
+</worldbody>
+<sensor><jointpos name="height" joint="height" noise=".001"/></sensor></mujoco>"""
 
 HELD = """
 <mujoco><option timestep=".002" integrator="{integrator}"/>

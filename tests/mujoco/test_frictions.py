@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import torch
 
+from sbi_active import BoxActions
 from sbi_active.criticism import AugmentedSimulator
 from sbi_active.mujoco import from_mjcf, mjcf_effects
 from sbi_active.mujoco.effects.changes import FrictionChange
@@ -61,8 +62,6 @@ def test_friction_by_load_grows_with_the_force_of_the_motor():
       <body><joint name="rail" type="slide" axis="1 0 0"/><geom size=".1" mass="1"/>
       </body></worldbody><actuator><motor name="push" joint="rail"/></actuator>
       </mujoco>"""
-    from sbi_active import BoxActions
-
     robot = from_mjcf(
         cart,
         {"rail.damping": (0.0, 0.1)},

@@ -50,26 +50,22 @@ def gain_error(posterior: ExactPosterior, action: float) -> float:
     return float((gain.mean() - exact) / (gain.std() / len(gain) ** 0.5))
 
 
-def cell_masses(posterior: ExactPosterior) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Cell edges and masses by the midpoint rule; theta_1 > 0 only where g is even.
+def cells(posterior: ExactPosterior) -> tuple[np.ndarray, np.ndarray]:
+    """Edges and probabilities of cells by the midpoint rule.
 
-    The grid covers the samples with a margin: mass they miss is missing from the total.
+    They cover the samples with a margin, of theta_1 > 0 alone where g is even.
     """
+    is_even = posterior.variant == "square"
     theta = posterior.sample(4000, seed=3).numpy()
-    if posterior.variant == "square":
-        theta = abs(theta)
-        theta[:, 1] = posterior.sample(4000, seed=3)[:, 1]
+    if is_even:
+        theta[:, 0] = abs(theta[:, 0])
     margin = 0.5 * np.ptp(theta, axis=0)
-    lowest = [0.0 if posterior.variant == "square" else -5.0, -5.0]
-    low = np.maximum(theta.min(0) - margin, lowest)
-    high = np.minimum(theta.max(0) + margin, 5.0)
-    edges = np.linspace(low, high, 801)
+    low = np.maximum(theta.min(0) - margin, [0.0 if is_even else -5.0, -5.0])
+    edges = np.linspace(low, np.minimum(theta.max(0) + margin, 5.0), 801)
     centers = 0.5 * (edges[1:] + edges[:-1])
-    theta_1, theta_2 = np.meshgrid(*centers.T, indexing="ij")
-    cells = np.stack([theta_1.ravel(), theta_2.ravel()], 1)
-    area = np.prod(edges[1] - edges[0])
-    mass = posterior.log_prob(cells).exp().reshape(800, 800).numpy() * area
-    return edges[:, 0], edges[:, 1], mass
+    grid = np.stack(np.meshgrid(*centers.T, indexing="ij"), -1).reshape(-1, 2)
+    mass = posterior.log_prob(grid).exp().reshape(800, 800).numpy()
+    return edges, mass / mass.sum()
 
 
 # Density and samples
@@ -91,27 +87,24 @@ def test_evidence_against_prior_samples(action: list[float], variant: str) -> No
 @pytest.mark.parametrize(("variant", "history"), CASES)
 def test_samples_follow_the_density(history: str, variant: str) -> None:
     posterior = posterior_of(history, variant)
-    edges_1, edges_2, mass = cell_masses(posterior)
-    mass = mass / mass.sum()
+    edges, mass = cells(posterior)
     theta = posterior.sample(4000, seed=5).numpy()
     if variant == "square":
         positive = theta[:, 0] > 0
         assert abs(positive.mean() - 0.5) < 4 * 0.5 / len(theta) ** 0.5
         theta = theta * np.where(positive, 1.0, -1.0)[:, None] ** [1, 0]
-    for edges, marginal, draws in (
-        (edges_1, mass.sum(1), theta[:, 0]),
-        (edges_2, mass.sum(0), theta[:, 1]),
-    ):
-        cdf = np.append(0.0, np.cumsum(marginal))
-        assert (
-            stats.kstest(draws, lambda t, e=edges, c=cdf: np.interp(t, e, c))[1] > 1e-3
+    for k in range(2):
+        cdf = np.append(0.0, mass.sum(1 - k).cumsum())
+        p = stats.kstest(
+            theta[:, k], lambda t, k=k, c=cdf: np.interp(t, edges[:, k], c)
         )
-    center_1, center_2 = edges_1[1:] + edges_1[:-1], edges_2[1:] + edges_2[:-1]
-    center_1, center_2 = 0.5 * center_1, 0.5 * center_2
-    mean = np.array([center_1 @ mass.sum(1), center_2 @ mass.sum(0)])
-    covariance = (center_1 - mean[0]) @ mass @ (center_2 - mean[1])
+        assert p[1] > 1e-3
+    center = 0.5 * (edges[1:] + edges[:-1])
+    mean = np.array([center[:, 0] @ mass.sum(1), center[:, 1] @ mass.sum(0)])
+    off = center - mean
     product = (theta - mean).prod(1)
-    assert abs(product.mean() - covariance) < 4 * product.std() / len(theta) ** 0.5
+    error = product.std() / len(theta) ** 0.5
+    assert abs(product.mean() - off[:, 0] @ mass @ off[:, 1]) < 4 * error
 
 
 # Predictive and gain

@@ -4,14 +4,7 @@ import numpy as np
 import pytest
 import torch
 from sbi.utils import BoxUniform
-from torch.distributions import (
-    HalfNormal,
-    LogNormal,
-    Normal,
-    TransformedDistribution,
-    Uniform,
-)
-from torch.distributions.transforms import PowerTransform
+from torch.distributions import HalfNormal, LogNormal, Normal, Uniform
 
 from sbi_active import Campaign, DiscreteActions, GaussianNoise, SimulatorModel
 from sbi_active.criticism import (
@@ -42,10 +35,7 @@ def loop(*effects, model=MODEL):
         ({"null": NAN}, "expected a null of effect 'bias'; got NaN"),
         ({"null": [0.0, 0.0]}, r"expected a null of effect 'bias' of shape \(1,\)"),
         ({"prior": 1.0}, "expected a continuous torch prior of effect 'bias'"),
-        (
-            {"prior": TransformedDistribution(Normal(0.0, 1.0), [PowerTransform(0.5)])},
-            "expected finite draws from the prior of effect 'bias'; got NaN or inf",
-        ),
+        ({"prior": LogNormal(0.0, 200.0)}, "expected finite draws .*; got NaN or inf"),
     ],
 )
 def test_parts_that_are_none_are_refused(changes, message):

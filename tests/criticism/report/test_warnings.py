@@ -85,11 +85,11 @@ def errors(after):
     return {"evaluation": replace(HELD, table=table)}
 
 
-def growing(rate, num=9):
-    made = residuals(num=num)
-    z = made.refitted * np.exp(rate * np.arange(num))[:, None]
+def growing(rate):
+    made = residuals(num=9)
+    z = made.refitted * np.exp(rate * np.arange(9))[:, None]
     grown = replace(made, refitted=z, x=2 + z)
-    own = trials(SHUFFLED[:num])
+    own = trials(SHUFFLED)
     return {"residuals": grown, "residuals_after": grown, "trials": own}
 
 
