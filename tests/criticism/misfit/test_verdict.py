@@ -103,11 +103,11 @@ def test_likely_models_that_bend_have_samples_of_their_posterior():
     assert rmse["after"] == pytest.approx(np.sqrt((error**2).mean()), rel=0.2)
 
 
-def scattered(size, *effects):
+def scattered(size, *effects, num=16, seed=1):
     """A loop on numbers without a time axis, of errors with some size each."""
-    action = torch.linspace(-2, 2, 16, dtype=torch.float64)[:, None]
-    draws = torch.Generator().manual_seed(1)
-    error = torch.randn(16, 1, generator=draws, dtype=torch.float64)
+    action = torch.linspace(-2, 2, num, dtype=torch.float64)[:, None]
+    draws = torch.Generator().manual_seed(seed)
+    error = torch.randn(num, 1, generator=draws, dtype=torch.float64)
     model = SimulatorModel(lambda theta, xi: theta * xi, noise=GaussianNoise(0.1))
     prior = BoxUniform(-5 * torch.ones(1), 5 * torch.ones(1))
     trials = Trials(action, action + size(action) * error)
@@ -172,13 +172,9 @@ def test_a_set_with_an_effect_on_the_noise_has_draws_for_the_next_action():
 
 def test_left_out_trials_of_a_few_that_scatter_have_errors_as_large():
     """Without one of seven trials the others may not show that they scatter."""
-    action, covered = torch.linspace(-1, 1, 7, dtype=torch.float64)[:, None], []
-    model = SimulatorModel(lambda theta, a: theta * a, noise=GaussianNoise(0.1))
-    prior = BoxUniform(-5 * torch.ones(1), 5 * torch.ones(1))
+    covered = []
     for seed in range(8):
-        gen = torch.Generator().manual_seed(seed)
-        error = 0.3 * torch.randn(7, 1, generator=gen, dtype=torch.float64)
-        loop = Criticism(model, prior, Trials(action, 2 * action + error), seed=seed)
+        loop = scattered(lambda action: 0.3, num=7, seed=seed)
         if loop.trace().verdict == "scatter":
             covered.append(loop.evaluate().after["coverage"].mean())
     assert len(covered) >= 4

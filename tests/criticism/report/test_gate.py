@@ -9,6 +9,7 @@ from sbi.utils import BoxUniform
 from sbi_active import DiscreteActions, GaussianNoise, SimulatorModel
 from sbi_active.criticism import Trials, close_loop, generic_effects
 from sbi_active.criticism.report.gate import EXIT_CODES
+from tests.criticism import block
 from tests.effects import BIAS
 
 NOISE = 0.1
@@ -114,13 +115,10 @@ def test_trajectories_that_tell_a_product_alone_are_not_identifiable():
 
 
 def test_three_trials_of_which_one_contradicts():
-    block = SimulatorModel(
-        lambda theta, v: v**2 / (19.62 * theta), noise=GaussianNoise(0.005)
-    )
-    prior = BoxUniform(torch.tensor([0.1]), torch.tensor([1.0]))
-    trials = Trials([1.0, 2.0, 3.0], [0.127, 0.510, 2.3])
-    effects = generic_effects(block, trials, prior=prior)
-    gate = close_loop(block, prior, trials, effects=effects, plan=False).gate
+    model = SimulatorModel(block.stop, noise=GaussianNoise(block.SENSOR))
+    prior, trials = block.friction(0.1), Trials([1.0, 2.0, 3.0], [0.127, 0.510, 2.3])
+    effects = generic_effects(model, trials, prior=prior)
+    gate = close_loop(model, prior, trials, effects=effects, plan=False).gate
     assert gate.decision == "NOT_ENOUGH_DATA"
     assert gate.details == {"trials": ["2"]}
     assert "trial 2 does not agree" in gate.reason
