@@ -10,7 +10,12 @@ from scipy.stats import entropy
 
 from sbi_active import DiscreteActions, GaussianNoise, SimulatorModel
 from sbi_active.criticism import Criticism, Trials, next_action
-from sbi_active.criticism.next_action import beyond_range, choose_action
+from sbi_active.criticism.next_action import (
+    PredictedRival,
+    beyond_range,
+    choose_action,
+)
+from sbi_active.criticism.results import ModelKey
 from tests.criticism.misfit.oscillator import ACTION, EFFECTS, trials
 from tests.criticism.misfit.oscillator import MODEL as OSCILLATOR
 from tests.criticism.misfit.oscillator import PRIOR as RATES
@@ -41,6 +46,24 @@ def only(c, *names):
     tracing = c.trace()
     kept = {k: p for k, p in tracing.probabilities.items() if k in names}
     return replace(tracing, probabilities=kept)
+
+
+def test_rivals_predict_their_posterior_predictive():
+    action = torch.tensor([1.0, 2.0, 3.0, 2.0])
+    c = criticism(action.tolist(), 0.7 * action, [], FORWARD)
+    c.trace()
+    rival = PredictedRival(c.rivals, ModelKey(), 0.5, FORWARD.values)
+    x, *_ = rival.predict(torch.tensor([2.5]), 4_000, 3)
+    assert x.shape == (4_000, 1)
+    assert torch.equal(x, rival.predict(torch.tensor([2.5]), 4_000, 3)[0])
+    assert not torch.equal(x, rival.predict(torch.tensor([2.5]), 4_000, 4)[0])
+    # Least squares in one parameter; errors of the mean and of the deviation.
+    fit = c.rivals.trials
+    square = float((fit.action**2).sum())
+    slope = float((fit.action * fit.x).sum()) / square
+    sd = NOISE * (1 + 2.5**2 / square) ** 0.5
+    assert float(x.mean()) == pytest.approx(2.5 * slope, abs=5 * sd / 4_000**0.5)
+    assert float(x.std()) == pytest.approx(sd, rel=5 / 8_000**0.5 + 0.02)
 
 
 def test_the_other_way_separates_a_tilt():
