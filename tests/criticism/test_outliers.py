@@ -61,9 +61,10 @@ def test_a_gross_error_is_named_by_the_trial_s_own_index(size):
 def test_a_slip_along_a_trajectory_is_an_outlier_and_no_process(num, wrong):
     own = oscillator.trials(action=oscillator.ACTION[:num])
     own.x[wrong] /= 100  # metres for centimetres
-    found = Criticism(oscillator.MODEL, oscillator.PRIOR, own).trace()
-    assert found.verdict == "outlier"
-    assert credible_set(found.outliers) == (float(wrong),)
+    loop = Criticism(oscillator.MODEL, oscillator.PRIOR, own)
+    assert loop.misfit() is None
+    assert loop.trace().verdict == "outlier"
+    assert credible_set(loop.trace().outliers) == (float(wrong),)
 
 
 def test_what_nothing_explains_ends_no_loop():

@@ -131,6 +131,9 @@ def test_no_effect_is_named_whose_predictions_did_not_hold():
     (trial,) = report.tested
     assert report.tracing.misfit.named == trial.registered.effects == ("lag",)
     assert trial.held
+    # As wide as errors on left-out trials, which t of few trials widens.
+    own, left_out = trial.registered, report.tracing.misfit.of("lag").left_out[0]
+    assert left_out < own.limit * own.sd.mean() < 3 * left_out
     assert unless_unproven(report, [trial]) is report
     failed = replace(trial, registered=replace(trial.registered, limit=0.0))
     assert unless_unproven(report, [failed, trial]) is report

@@ -20,7 +20,7 @@ KERNELS = (
 )
 
 
-def problem(*, low=-np.inf, ragged=False, differs=False):
+def problem(*, low=-np.inf, ragged=False):
     rng = np.random.default_rng(0)
     x = rng.normal(size=(NUM, SAMPLES))
     if ragged:
@@ -37,10 +37,10 @@ def problem(*, low=-np.inf, ragged=False, differs=False):
         scaled=np.array([False, True]),
         low=np.array([-np.inf, low]),
     )
-    return model, errors_of(m, jacobian if differs else None)
+    return model, errors_of(m)
 
 
-def errors_of(m, varying):
+def errors_of(m, varying=None):
     unit = np.full(len(m), 0.5)
     noise = NoiseGrid([NoiseCell.of(m, sd=unit)])
     return Errors(m, unit, noise, largest=2.0, varying=varying)
