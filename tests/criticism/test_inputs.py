@@ -47,6 +47,18 @@ def test_what_a_motor_lacks_is_found_proposed_and_simulated_on():
     assert float(error.square().mean().sqrt()) > 0.1
 
 
+def test_equal_actions_with_other_inputs_are_simulated_apart():
+    def summed(theta, action, *, inputs):
+        return theta * inputs["u"].sum(1, keepdim=True) + action
+
+    model = SimulatorModel(summed, noise=GaussianNoise(0.1))
+    inputs = {"u": torch.tensor([[1.0, 2.0], [3.0, 4.0], [1.0, 2.0]])}
+    given = {"inputs": inputs, "input_times": [0.0, 1.0]}
+    trials = Trials(torch.zeros(3), torch.zeros(3), **given)
+    simulator = TrialSimulator(AugmentedSimulator(model, []), trials)
+    assert simulator.predict(torch.ones(1, 1), {})[0].tolist() == [[3.0, 7.0, 3.0]]
+
+
 def test_a_function_of_one_row_gets_its_own_inputs():
     shapes = []
 

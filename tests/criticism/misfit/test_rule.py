@@ -206,3 +206,8 @@ def test_no_model_wins_by_one_part_alone():
     found = weights_by_error(errors, dict.fromkeys(errors, 0.0), seed=0)
     of_the_mean = 1 / (1 + (one.mean() / bare.mean()) ** 3.5)
     assert 0.5 < found[ModelKey(("a",))] < of_the_mean - 0.05
+    uncounted = {key: np.append(own, np.nan) for key, own in errors.items()}
+    assert weights_by_error(uncounted, dict.fromkeys(errors, 0.0), seed=0) == found
+    alike, prior = dict.fromkeys(errors, bare), {ModelKey(): np.log(3)}
+    found = weights_by_error(alike, dict.fromkeys(errors, 0.0) | prior, seed=0)
+    assert found[ModelKey()] == pytest.approx(0.75)

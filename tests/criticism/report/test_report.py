@@ -56,6 +56,16 @@ def test_a_report_pickles_with_effects_that_are_local_functions():
 # The page, its tables and figures
 
 
+def test_markdown_tables_have_as_many_cells_as_headings():
+    shares = {"a|b": 0.6, "drag": 0.4}
+    made = report(tracing=tracing(probabilities=shares, credible_set=(*shares,)))
+    text = re.sub(r"\\\|", "", made.to_markdown())
+    blocks = re.findall(r"(?:^\|.*\|$\n?)+", text, flags=re.MULTILINE)
+    assert len(blocks) == 4
+    for block in blocks:
+        assert len({line.count("|") for line in block.splitlines()}) == 1
+
+
 def test_save_writes_the_page_and_every_figure(tmp_path):
     page = report().save(tmp_path / "out")
     pictures = {"residuals.png", "before_after.png"}
