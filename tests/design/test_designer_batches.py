@@ -1,5 +1,6 @@
 """Batches and pending trials against the linear-Gaussian closed form."""
 
+import pytest
 import torch
 
 from sbi_active import (
@@ -9,7 +10,7 @@ from sbi_active import (
     InformationGainDesigner,
     SimulatorModel,
 )
-from tests.linear_gaussian import PRIOR
+from tests.linear_gaussian import PRIOR, log_normal
 
 ANGLES = DiscreteActions([0.0, 0.25, 1.0], names=["angle"])
 
@@ -33,17 +34,17 @@ def joint(*actions):
 MODEL = SimulatorModel(along, noise=GaussianNoise(1.0))
 
 
-def select(
-    actions=ANGLES,
-    model=None,
-    simulator=MODEL,
-    estimator="auto",
-    num_samples=1_000,
-    **options,
-):
-    designer = InformationGainDesigner(
-        actions, num_samples=num_samples, estimator=estimator
-    )
+class Likelihood:
+    """The exact likelihood of it."""
+
+    exact_likelihood = True
+
+    def log_likelihood(self, x, theta, action):
+        return log_normal(x - along(theta, action), 1.0)
+
+
+def select(model=None, simulator=MODEL, estimator="auto", **options):
+    designer = InformationGainDesigner(ANGLES, num_samples=1_000, estimator=estimator)
     return designer.select(model, simulator, belief=PRIOR, seed=0, **options)
 
 
@@ -68,14 +69,18 @@ def test_a_batch_is_chosen_by_joint_information():
     assert repr(design).startswith("Design(2 actions, joint EIG 2.")
 
 
-def test_pending_trials_count_as_known():
-    design = select(pending=torch.tensor([[0.0]]))
+@pytest.mark.parametrize(
+    ("estimator", "model"), [("auto", None), ("likelihood", Likelihood())]
+)
+def test_pending_trials_count_as_known(estimator, model):
+    design = select(model, estimator=estimator, pending=torch.tensor([[0.0]]))
     assert design.action.tolist() == [1.0]
     assert design.bound == "none"
     given = torch.tensor([joint(0.0, float(a)) - joint(0.0) for a in ANGLES.values])
     distance = (design.expected_information_gain - given).abs()
     assert (distance < 4 * design.standard_error + 0.1).all()
-    third = select(pending=torch.tensor([[0.0], [1.0]]))
+    both = torch.tensor([[0.0], [1.0]])
+    third = select(model, estimator=estimator, pending=both)
     assert float(third.expected_information_gain.max()) < 1.0  # both directions known
 
 

@@ -49,11 +49,8 @@ def test_which_search():
     with pytest.warns(DeprecationWarning, match='use search="gradient"'):
         designer = InformationGainDesigner(BOX, search="bayesopt")
     assert isinstance(designer.search, GradientSearch)
-    for search, space, error in (
-        ("grid", BOX, "expected search among 'auto', 'gradient'"),
-    ):
-        with pytest.raises((TypeError, ValueError), match=error):
-            InformationGainDesigner(space, search=search)
+    with pytest.raises(ValueError, match="expected search among 'auto', 'gradient'"):
+        InformationGainDesigner(BOX, search="grid")
     with pytest.raises(ValueError, match="expected a budget >= "):
         InformationGainDesigner(BOX).select(ExactModel(), simulator, budget=500, seed=0)
 

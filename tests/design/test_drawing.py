@@ -18,44 +18,22 @@ def _closed():
     plt.close("all")
 
 
-def design(actions, num=30, index=4, candidates=None, **changes):
-    rows = actions.sample((num,), seed=0) if candidates is None else candidates
+def design(actions):
+    rows = actions.sample((30,), seed=0)
     gain = rows.double().square().sum(1)
-    error = torch.full_like(gain, 0.05)
-    made = {
-        "action": rows[index],
-        "candidates": rows,
-        "expected_information_gain": gain,
-        "standard_error": error,
-        "difference_standard_error": error,
-        "probability_best": error,
-        "probability_valid": torch.ones(len(rows)),
-        "bound": "lower",
-        "index": index,
-        "num_simulations": 30,
-        "labels": actions.entry_labels,
-    }
-    return Design(**(made | changes))
+    error = [torch.full_like(gain, 0.05)] * 4
+    made = {"bound": "lower", "index": 4, "num_simulations": 30}
+    return Design(rows[4], rows, gain, *error, **made, labels=actions.entry_labels)
 
 
 BOX = BoxActions([0.0, -1.0], [2.0, 1.0], names=["speed", "tilt"], units=["m/s", ""])
 
 
-def offsets(marks):
-    return np.asarray(marks.get_offsets())
-
-
-def map_marks(ax):
-    """Return the points of the map in the order of the candidates."""
-    (marks,) = [c for c in ax.collections if len(c.get_offsets()) > 1]
-    return marks
-
-
 def test_two_entries_make_a_map_with_every_candidate_and_the_chosen_one():
     made = design(BOX)
     ax = made.plot()
-    marks = map_marks(ax)
-    np.testing.assert_allclose(offsets(marks), made.candidates)
+    (marks,) = [c for c in ax.collections if len(c.get_offsets()) > 1]
+    np.testing.assert_allclose(marks.get_offsets(), made.candidates)
     np.testing.assert_allclose(marks.get_array(), made.expected_information_gain)
     (chosen,) = [each for each in ax.lines if each.get_label() == "chosen"]
     np.testing.assert_allclose(chosen.get_xydata()[0], made.action)

@@ -10,28 +10,21 @@ NAMES = [*"abcdef"]
 
 def product(*weights, shifts=()):
     shifts = dict(shifts)
-    return Combination(
-        tuple(
-            Term(i, w, log=True, shift=shifts.get(i, 0.0))
-            for i, w in enumerate(weights)
-        )
-    )
+    shift = [shifts.get(i, 0.0) for i in range(len(weights))]
+    terms = zip(range(len(weights)), weights, shift, strict=True)
+    return Combination(tuple(Term(i, w, log=True, shift=s) for i, w, s in terms))
 
 
 @pytest.mark.parametrize(
     ("combination", "text"),
     [
-        (product(1, 1), "a * b"),
-        (product(1, -1), "a / b"),
         (product(2, -0.5), "a^2 / b^0.5"),
         (product(-1, 1), "1 / a * b"),
-        (product(1, 1, shifts={1: 0.5}), "a * (b + 0.5)"),
         (product(1, -1, shifts={0: -0.25}), "(a - 0.25) / b"),
         (Combination((Term(0), Term(1, -0.8))), "a - 0.8 * b"),
         (Combination((Term(0, -1.0), Term(1))), "-a + b"),
         (Combination((Term(0, log=True), Term(1, -2.0))), "a * exp(-2 * b)"),
         (Combination((Term(0), Term(1, log=True))), "b * exp(a)"),
-        (Combination(tuple(map(Term, range(5)))), "a + b + c + d + ..."),
         (product(1, 1, 1, 1, 1), "a * b * c * d * ..."),
     ],
 )

@@ -147,7 +147,6 @@ def test_bad_input(run, text):
 @pytest.mark.parametrize(
     ("fn", "options", "text"),
     [
-        (lambda t, a: t[:1], {}, r"expected x with one row a parameter set"),
         (lambda t, a: 3.0, {}, r"expected x with one row a parameter set"),
         (line, {"channel_names": ["x", "y"]}, "expected 2 channels, x, y; got x of"),
         (

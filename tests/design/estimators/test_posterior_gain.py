@@ -1,3 +1,5 @@
+import math
+
 import pytest
 import torch
 
@@ -6,31 +8,21 @@ from sbi_active.design.estimators.base import CandidateSimulations
 from tests.linear_gaussian import PRIOR, ExactModel, information, simulator
 
 
-def simulations(actions=(0.0, 1.0, 2.0), n=4_000, seed=0):
-    generator = torch.Generator().manual_seed(seed)
-    theta = torch.randn(n, 2, generator=generator)
-    action = torch.tensor(actions)[:, None]
+def simulations(n=4_000):
+    theta, action = torch.randn(n, 2), torch.tensor([[0.0], [1.0], [2.0]])
     x = torch.stack([simulator(theta, a.expand(n, 1)) for a in action])
     return CandidateSimulations(theta, action, x)
 
 
-def test_the_exact_posterior_gives_the_information():
-    rows = simulations()
-    gain = PosteriorGain()(ExactModel(), rows, PRIOR)
-    error = gain.std(1) / gain.shape[1] ** 0.5
-    distance = (gain.mean(1) - information(rows.action)).abs()
-    assert (distance <= 4 * error + 1e-6).all()
-
-
-def test_a_model_of_the_wrong_spread_loses_what_the_divergence_says():
+@pytest.mark.parametrize("spread", [1.0, 2.0])
+def test_a_model_of_the_wrong_spread_loses_what_the_divergence_says(spread):
     """E U = I - KL(N(m, s) || N(m, (k s)^2)) in each of two dimensions."""
     rows = simulations()
-    spread = torch.tensor(2.0)
-    gain = PosteriorGain()(ExactModel(spread=2.0), rows, PRIOR)
-    loss = 2 * (spread.log() + 0.5 / spread**2 - 0.5)
+    gain = PosteriorGain()(ExactModel(spread=spread), rows, PRIOR)
+    loss = 2 * (math.log(spread) + 0.5 / spread**2 - 0.5)
     error = gain.std(1) / gain.shape[1] ** 0.5
     distance = (gain.mean(1) - (information(rows.action) - loss)).abs()
-    assert (distance < 4 * error).all()
+    assert (distance <= 4 * error + 1e-6).all()
 
 
 def test_outcomes_without_a_density_are_not_left_out_of_the_mean():

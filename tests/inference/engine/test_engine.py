@@ -109,12 +109,7 @@ def spread():
 @pytest.mark.parametrize(
     ("sd", "seed", "settings", "most"),
     [
-        (
-            1e-3,
-            1,
-            Settings(num_effective=100, num_draws=200, share_of_plenty=0),
-            12_000,
-        ),
+        (1e-3, 1, FEW, 12_000),
         (1e-4, 0, Settings(), 30_000),
         (1e-4, 1, Settings(), 30_000),
     ],
@@ -202,8 +197,9 @@ def test_finds_narrow_peaks(centers: list, sd: list):
     assert abs(share - 1 / len(place)).max() < 4 * error
 
 
-@pytest.mark.parametrize("dim", [12])
-def test_a_density_cut_at_many_edges(dim: int):
+def test_a_density_cut_at_many_edges():
+    dim = 12
+
     # A normal density about a corner of the box, 1 in 2^d of which is within.
     def log_density(z: np.ndarray) -> np.ndarray:
         log_prob = -0.5 * (((z - 1) / 0.2) ** 2).sum(1) - dim * np.log(0.2)

@@ -100,6 +100,7 @@ def test_the_posterior_takes_outcomes_without_a_measurement():
     x[theta[:, 0] > 1] = torch.nan
     x[theta[:, 1] > 1, 1] = torch.nan
     posterior = trained(SMALL, data=(theta, x, action)).build_posterior()
+    assert isinstance(posterior, ActionPosterior)
     none, part = torch.full((2,), torch.nan), torch.tensor([0.3, torch.nan])
     draws = posterior.sample((500,), x=none, action=torch.ones(1))
     assert float(draws[:, 0].mean()) > 0.8  # E[theta_1 | theta_1 > 1] = 1.53
@@ -114,6 +115,7 @@ def test_the_posterior_takes_outcomes_without_a_measurement():
         draws[:5, None].expand(5, 3, 2), both, torch.ones(3, 1)
     )
     assert torch.allclose(batch, single, atol=1e-4)
+    assert posterior.sample((), **at[1]).shape == (2,)
     best = posterior.map(num_iter=5, num_to_optimize=5, **at[2])
     assert float(best.reshape(-1)[0]) > 0.5
     # the same network, had it seen complete rows_of alone, says so
@@ -166,24 +168,6 @@ def test_belief_is_a_distribution():
     again = pickle.loads(pickle.dumps(belief))
     theta = belief.sample((5,))
     assert torch.equal(again.log_prob(theta), belief.log_prob(theta))
-
-
-@pytest.mark.filterwarnings("ignore")
-def test_action_posterior_offers_what_sbi_s_do():
-    posterior = trained(QUICK, prior=BOX).build_posterior()
-    assert isinstance(posterior, ActionPosterior)
-    x, action = torch.tensor([0.5, 0.5]), torch.tensor([2.0])
-    theta = posterior.sample((100,), x=x, action=action)
-    assert theta.shape == (100, 2)
-    assert posterior.sample((), x=x, action=action).shape == (2,)
-    assert posterior.log_prob(theta, x=x, action=action).shape == (100,)
-    xs, actions = torch.rand(3, 2), torch.rand(3, 1)
-    assert posterior.sample_batched((5,), x=xs, action=actions).shape == (5, 3, 2)
-    batched = posterior.log_prob_batched(theta[:30].reshape(10, 3, 2), xs, actions)
-    assert batched.shape == (10, 3)
-    best = posterior.map(x=x, action=action, num_iter=20, num_to_optimize=5)
-    peak = posterior.log_prob(best.reshape(1, 2), x=x, action=action)
-    assert peak >= posterior.log_prob(theta, x=x, action=action).median()
 
 
 def test_truncated_proposals_of_the_belief_pass_and_others_do_not():

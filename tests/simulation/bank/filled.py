@@ -4,6 +4,7 @@ import sqlite3
 from contextlib import closing
 
 import torch
+from torch.distributions import MultivariateNormal
 
 from sbi_active import Bank
 from sbi_active.simulation import Simulations
@@ -17,10 +18,6 @@ def simulator(theta, action):
     return theta
 
 
-def prior():
-    return torch.distributions.MultivariateNormal(torch.zeros(2), torch.eye(2))
-
-
 def append(bank, rows, seed):
     """Store rows that were simulated elsewhere, and return how many were new."""
     before, columns = len(bank), {**vars(rows)}
@@ -29,17 +26,14 @@ def append(bank, rows, seed):
     return len(bank) - before
 
 
-def fill(bank, seeds=(0, 1, 2, 3), num=5):
-    for seed in seeds:
-        theta = torch.full((num, 2), float(seed))
-        rows = Simulations(theta, theta[:, :1], theta)
-        append(bank.drawn_from(prior()), rows, seed)
-
-
 def filled(path):
     """Return the folder of a bank with four segments of five rows."""
+    prior = MultivariateNormal(torch.zeros(2), torch.eye(2))
     with Bank(path, simulator=simulator) as bank:
-        fill(bank)
+        for seed in range(4):
+            theta = torch.full((5, 2), float(seed))
+            rows = Simulations(theta, theta[:, :1], theta)
+            append(bank.drawn_from(prior), rows, seed)
     return bank.path
 
 
@@ -57,10 +51,6 @@ def crafted(folder, kind, number, content):
     with store.writing():
         store.put(kind, content, number)
     store.close()
-
-
-def remove(folder, number):
-    execute(folder, "DELETE FROM records WHERE kind = 'rows' AND number = ?", number)
 
 
 def flip(path, position):

@@ -199,8 +199,78 @@ def test_numbers_that_float32_cannot_hold_and_seeds_beyond_int64(folder):
         large = Simulations(rows, rows[:, :1], rows.double() * 1e39)
         with pytest.raises(ValueError, match=r"x within \+-3.4e38.*got 1e\+39"):
             append(bank, large, 0)
-        with pytest.raises(ValueError, match=r"x of real numbers; got torch.complex64"):
-            append(bank, Simulations(rows, rows[:, :1], rows + 1j, torch.zeros(3)), 0)
         for seed in (np.int64(8), 2**70):
             assert append(bank, Simulations(rows, rows[:, :1], rows), seed) == 3
     assert len(Bank(folder)) == 26
+
+
+# Segments missing, exchanged or of another bank: one error names them
+
+
+def remove(folder, number):
+    execute(folder, "DELETE FROM records WHERE kind = 'rows' AND number = ?", number)
+
+
+def renumber(folder, number, another):
+    statement = "UPDATE records SET number = ? WHERE kind = 'rows' AND number = ?"
+    execute(folder, statement, another, number)
+
+
+def swap(folder):
+    renumber(folder, 2, 9)
+    renumber(folder, 3, 2)
+    renumber(folder, 9, 3)
+
+
+def duplicate_in_place_of_another(folder):
+    remove(folder, 3)
+    execute(
+        folder,
+        "INSERT INTO records SELECT kind, 3, digest, content FROM records WHERE "
+        "kind = 'rows' AND number = 2",
+    )
+
+
+def close_the_gap_by_hand(folder):
+    remove(folder, 2)
+    renumber(folder, 3, 2)
+    renumber(folder, 4, 3)
+    crafted(folder, "catalog", 0, {"bank rows": 0, "rows": 3})
+
+
+def take_from_another_bank(folder):
+    other = filled(folder.parent / "other")
+    remove(folder, 2)
+    (row,) = execute(other, "SELECT * FROM records WHERE kind = 'rows' AND number = 2")
+    execute(folder, "INSERT INTO records VALUES (?, ?, ?, ?)", *row)
+
+
+def lose_x(folder):
+    change = "UPDATE records SET content = x'' WHERE kind = 'x of rows' AND number = 2"
+    execute(folder, change)
+
+
+def lose_all(folder):
+    execute(folder, "DELETE FROM records WHERE kind = 'rows'")
+
+
+MISPLACED = [swap, duplicate_in_place_of_another, close_the_gap_by_hand]
+MISPLACED += [take_from_another_bank, lose_x, lose_all]
+
+
+@pytest.mark.parametrize("misplace", MISPLACED)
+def test_misplaced_segments_are_named(folder, misplace):
+    misplace(folder)
+    with pytest.raises(CorruptSegmentError, match=str(folder / FILE)):
+        Bank(folder).read()
+    with pytest.raises(CorruptSegmentError):
+        Bank(folder).verify()
+    with pytest.raises(CorruptSegmentError):  # still
+        Bank(folder).read()
+
+
+def test_a_bank_of_an_earlier_release_is_named(tmp_path):
+    (tmp_path / "bank.json").write_text("{}")
+    for options in ({}, {"simulator": simulator}):
+        with pytest.raises(ValueError, match="sbi-active migrate"):
+            Bank(tmp_path, **options)

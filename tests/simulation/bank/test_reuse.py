@@ -25,20 +25,15 @@ PRIOR, ROUND = normal(0.0, 2.0), normal(3.0, 1.0)
 TARGET = normal(1.0, 0.5)
 
 
-def fill(bank, *, num_rows=2_000, seed=0):
-    """Store rows of both proposals, at two actions."""
-    torch.manual_seed(seed)
-    for proposal in (PRIOR, ROUND):
-        theta = proposal.sample((num_rows,))
-        action = torch.randint(2, (num_rows, 1)).float()
-        store = bank.drawn_from(proposal)
-        simulate(simulator, theta, action, seed=seed, store=store)
-
-
 @pytest.fixture
 def bank(tmp_path):
+    """Rows of both proposals, at two actions."""
     with Bank(tmp_path / "bank", simulator=simulator) as bank:
-        fill(bank)
+        for proposal in (PRIOR, ROUND):
+            theta = proposal.sample((2_000,))
+            action = torch.randint(2, (2_000, 1)).float()
+            store = bank.drawn_from(proposal)
+            simulate(simulator, theta, action, seed=0, store=store)
         yield bank
 
 

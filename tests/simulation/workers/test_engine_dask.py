@@ -27,6 +27,8 @@ distributed = pytest.importorskip(
 # A worker cannot import a test module.
 cloudpickle.register_pickle_by_value(sys.modules[__name__])
 
+SLOW = pytest.mark.slow
+
 
 @pytest.fixture(scope="module")
 def client():
@@ -61,28 +63,32 @@ class Reporting:
         return seeded(theta, action, seeds)
 
 
-def kill_at_work(folder, killed):
-    """Kill the first process that is at its third call."""
-    while not killed:
-        calls = Counter(int(f.name.split("-")[0]) for f in folder.iterdir())
-        killed += [pid for pid, count in calls.items() if count >= 3][:1]
-        time.sleep(1e-3)
-    os.kill(killed[0], signal.SIGKILL)
-
-
-def test_a_worker_killed_in_the_middle_loses_nothing(client, rows, tmp_path):
+@pytest.mark.parametrize("all_at_once", [False, pytest.param(True, marks=SLOW)])
+def test_workers_killed_in_the_middle_lose_nothing(client, rows, tmp_path, all_at_once):
     client.wait_for_workers(2)
     expected = simulate(seeded, *rows, seed=0).x
     killed = []
-    killer = threading.Thread(target=kill_at_work, args=(tmp_path, killed), daemon=True)
+
+    def kill():
+        """Kill the first process that is at its third call, or all of them."""
+        while not killed:
+            calls = Counter(int(f.name.split("-")[0]) for f in tmp_path.iterdir())
+            killed.extend([pid for pid, count in calls.items() if count >= 3][:1])
+            time.sleep(1e-3)
+        if all_at_once:
+            killed[:] = client.run(os.getpid).values()
+        for pid in killed:
+            os.kill(pid, signal.SIGKILL)
+
+    killer = threading.Thread(target=kill, daemon=True)
     killer.start()
     with joblib.parallel_config(backend="dask"):
         result = simulate(Reporting(tmp_path), *rows, seed=0, workers=2, batch_size=10)
     killer.join(timeout=0)
-    assert not killer.is_alive()  # it was killed before the end
+    assert not killer.is_alive()  # they were killed before the end
     assert result.tracebacks == {}
     assert torch.equal(result.x, expected)
-    assert killed[0] not in client.run(os.getpid).values()
+    assert not {*killed} & {*client.run(os.getpid).values()}
 
 
 def test_a_row_that_hangs_costs_itself_on_a_cluster(client, rows):
@@ -104,7 +110,7 @@ def test_a_row_that_hangs_costs_itself_on_a_cluster(client, rows):
     assert torch.equal(result.x[result.valid], clean[result.valid])
 
 
-@pytest.mark.slow
+@SLOW
 def test_a_row_that_kills_every_worker_loses_no_good_row(client, rows):
     def killer(theta, action, seeds):
         if bool((action == 3).any()):
@@ -119,27 +125,6 @@ def test_a_row_that_kills_every_worker_loses_no_good_row(client, rows):
     assert result.tracebacks.keys() == {2}
     assert "ended by signal 9" in result.tracebacks[2]
     assert torch.equal(result.x[result.valid], theta[result.valid])
-
-
-@pytest.mark.slow
-def test_all_workers_killed_at_once_lose_nothing(client, rows, tmp_path):
-    client.wait_for_workers(2)
-    expected = simulate(seeded, *rows, seed=0).x
-
-    def kill():
-        while len([*tmp_path.iterdir()]) < 3:
-            time.sleep(1e-3)
-        for pid in client.run(os.getpid).values():
-            os.kill(pid, signal.SIGKILL)
-
-    killer = threading.Thread(target=kill, daemon=True)
-    killer.start()
-    with joblib.parallel_config(backend="dask"):
-        result = simulate(Reporting(tmp_path), *rows, seed=0, workers=2, batch_size=10)
-    killer.join(timeout=0)
-    assert not killer.is_alive()
-    assert result.tracebacks == {}
-    assert torch.equal(result.x, expected)
 
 
 def test_workers_that_the_cluster_gave_up_are_asked_for_again(rows, monkeypatch):
