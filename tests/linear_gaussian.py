@@ -6,7 +6,7 @@ import math
 
 import torch
 from torch import Tensor
-from torch.distributions import MultivariateNormal
+from torch.distributions import Distribution, MultivariateNormal
 
 DIM = 2
 PRIOR = MultivariateNormal(torch.zeros(DIM), torch.eye(DIM))
@@ -20,6 +20,21 @@ def moments(x: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
     """Posterior mean and variance of each parameter."""
     variance = 1 / (1 + action**2)
     return variance * action * x, variance.expand_as(x)
+
+
+def posterior(action: Tensor, x: Tensor) -> MultivariateNormal:
+    """Posterior of trials, action (t, 1) and x (t, DIM)."""
+    precision = 1 + action.square().sum()
+    return MultivariateNormal(
+        (action * x).sum(0) / precision, torch.eye(DIM) / precision
+    )
+
+
+def divergence(belief: Distribution, exact: Distribution) -> float:
+    """KL(exact || belief) in nats; its standard error is about .02."""
+    torch.manual_seed(0)
+    theta = exact.sample(torch.Size([4_000]))
+    return float((exact.log_prob(theta) - belief.log_prob(theta)).mean())
 
 
 def information(action: Tensor) -> Tensor:

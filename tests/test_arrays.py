@@ -9,7 +9,6 @@ from sbi.utils import BoxUniform
 
 from sbi_active import (
     Campaign,
-    CampaignOptions,
     DiscreteActions,
     InformationGainDesigner,
     SimulatorModel,
@@ -19,7 +18,6 @@ from sbi_active.criticism import Trials
 from sbi_active.criticism.data.tables import read_trials
 from sbi_active.criticism.misfit.rule import Rule
 from sbi_active.mujoco import from_mjcf
-from sbi_active.simulation.workers.settings import Workers
 
 MASKED = np.ma.masked_array([1.0, 2.0], mask=[False, True])
 
@@ -82,14 +80,12 @@ def slide(theta, action):
 @pytest.mark.parametrize(
     ("call", "wrong", "meant"),
     [
-        (CampaignOptions, "num_simulation", "num_simulations"),
         (lambda **k: Campaign(slide, PRIOR, ACTIONS, **k), "metod", "method"),
         (lambda **k: InformationGainDesigner(ACTIONS, **k), "estimators", "estimator"),
         (lambda **k: SimulatorModel(slide, **k), "noize", "noise"),
         (lambda **k: Trials([0.0], [0.0], **k), "sample_time", "sample_times"),
         (lambda **k: from_mjcf("", {}, **k), "sensor", "sensors"),
         (Rule, "chances", "chance"),
-        (Workers, "num_worker", "num_workers"),
     ],
 )
 def test_a_mistyped_keyword_is_told_with_the_one_that_was_meant(call, wrong, meant):

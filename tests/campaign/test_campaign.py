@@ -19,7 +19,6 @@ from sbi_active import (
 )
 from sbi_active.campaign.options import CampaignDetails
 from sbi_active.messages import RenamedWarning
-from sbi_active.simulation import Workers
 from tests.campaign.problem import ACTIONS, OPTIONS, PRIOR, campaign, draws, noisy
 
 
@@ -152,42 +151,17 @@ def test_other_errors():
             campaign(given={"effects": effects})
         with pytest.raises(TypeError, match="expected effects of class Effect; got '"):
             campaign().criticize(effects)  # pyright: ignore
-    c = campaign()
-    with pytest.raises(ValueError, match="expected the index of one of 0 trials"):
-        c.tell([1.0], trial=3)
-    with pytest.raises(ValueError, match="expected status 'ok', 'invalid' or"):
-        c.tell([1.0], status="lost")
-    c.ask()
-    with pytest.raises(ValueError, match="expected the outcome x; got None"):
-        c.tell()
-    with pytest.raises(ValueError, match=re.escape("expected x of shape (1,)")):
-        c.tell([1.0, 2.0])
-    with pytest.raises(ValueError, match="expected action of shape"):
-        c.tell([1.0], action=[1.0, 2.0])
-    assert c.pending is not None
-
-
-def test_the_smallest_options_are_taken():
-    least = {"num_simulations": 100, "num_samples": 8, "max_simulations": 100}
-    options = CampaignOptions.of({**least, "planned_trials": 1, "check_every": 1})
-    assert (options.num_simulations, options.workers) == (100, Workers())
-    assert CampaignOptions.of(options) is options
-    assert CampaignOptions.of(None) == CampaignOptions()
     with pytest.raises(TypeError, match="expected options of a campaign; got 3"):
         CampaignOptions.of(3)
 
 
 @pytest.mark.parametrize(
-    ("max_sd", "stops"),
-    [(0.11, True), (0.09, False), ([0.11, 0.21], True), ([0.11, 0.19], False)],
+    ("max_sd", "stops"), [(0.11, False), ([0.11, 0.21], True), ([0.11, 0.19], False)]
 )
 def test_every_parameter_must_be_known_to_stop(max_sd, stops):
     belief = MultivariateNormal(torch.zeros(2), torch.tensor([0.01, 0.04]).diag())
-    if isinstance(max_sd, float):
-        belief = MultivariateNormal(torch.zeros(2), 0.01 * torch.eye(2))
     reason = StopRules(max_sd=max_sd).reason(belief, None, seed=0)
     assert (reason is not None) == stops
-    assert StopRules().reason(belief, None, seed=0) is None
     with pytest.raises(ValueError, match="one for each of 2 parameters; got 3"):
         StopRules(max_sd=[1.0, 1.0, 1.0]).reason(belief, None, seed=0)
 

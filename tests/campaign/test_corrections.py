@@ -182,6 +182,10 @@ def test_a_correction_behind_an_adoption():
         ({"x": "abc"}, "expected x of real numbers; got 'abc'"),
         ({"x": np.array([1e39])}, "expected x within +-3.4e38, the range of float32"),
         ({"x": 1.0, "action": [np.nan]}, "expected a finite action"),
+        ({"x": 1.0, "action": [1.0, 2.0]}, "expected action of shape"),
+        ({"x": 1.0, "status": "lost"}, "expected status 'ok', 'invalid' or"),
+        ({"x": [1.0, 2.0]}, "expected x of shape (1,)"),
+        ({}, "expected the outcome x; got None"),
     ],
 )
 def test_what_is_refused_leaves_no_trace(told, text):
@@ -244,7 +248,7 @@ def test_each_kind_of_outcome_counts():
 class Faulty:
     """Raises on 5 % of the rows, NaN on 10 %; with a marker it hangs and dies, too."""
 
-    def __init__(self, marker=None):
+    def __init__(self, marker):
         self.marker = marker and str(marker)
 
     def __call__(self, theta, action, seeds):

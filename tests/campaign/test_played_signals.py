@@ -44,10 +44,9 @@ MODEL = SimulatorModel(
 )
 
 
-def motor(action, seed, *, dead=0.0):
+def motor(action, seed):
     """The real one, which plays what it is given."""
     u = SPACE.inputs(action)["voltage"][None]
-    u = u.sign() * (u.abs() - dead).clamp(min=0)
     x = speed(TRUTH, None, inputs={"voltage": u}, times=TIMES[None])[0]
     gen = torch.Generator().manual_seed(seed)
     return x + 0.02 * torch.randn(x.shape, generator=gen)

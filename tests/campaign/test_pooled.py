@@ -135,29 +135,6 @@ def test_no_simulation_beyond_the_budget():
     assert torch.allclose(mean, truth[0], atol=0.15)
 
 
-def test_it_goes_on_where_it_was_left(tmp_path):
-    model = SimulatorModel(slide, noise=GaussianNoise(0.05))
-    actions = DiscreteActions([0.5, 1.0])
-    options = {"max_simulations": 120, "planned_trials": 2}
-
-    def told(c):
-        trial = c.ask()
-        return c.tell(0.5 * torch.ones(2) * trial.action)
-
-    whole = Campaign(model, PRIOR, actions, options=options)
-    told(whole), told(whole), whole.update()
-    with Campaign(model, PRIOR, actions, options=options, directory=tmp_path) as c:
-        told(c)
-        c.ask()
-    with Campaign.load(tmp_path, simulator=model) as c:
-        spent = c.state.meter.spent
-        told(c), c.update()
-        assert spent <= c.state.meter.spent == whole.state.meter.spent
-        theta = PRIOR.sample((50,))
-        same = c.belief.log_prob(theta), whole.belief.log_prob(theta)
-        assert torch.allclose(*same, atol=1e-6)
-
-
 def test_an_effect_is_adopted_within_the_budget():
     """A pool learns the augmented simulator, and never the prior's 2,000 rows."""
     model = SimulatorModel(lambda t, a: t[:, :1] * a, noise=GaussianNoise(0.05))

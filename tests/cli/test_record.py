@@ -107,7 +107,8 @@ def test_what_is_computed_is_summed_up_no_more(camp):
 def test_what_was_refused_needs_the_campaign_once(camp, capsys):
     assert main(["tell", "camp", "0.4", "0.8", "--trial", "7"]) == 2
     assert "expected the index of one of 2 trials" in capsys.readouterr().err
-    assert [e["event"] for e in Campaign.load(camp).events][-1] == "refused"
+    last = Campaign.load(camp).events[-1]
+    assert (last["event"], last["x"]) == ("refused", "[0.4, 0.8]")
     assert record.Record(camp).summary["not_in_belief"] == []
 
 

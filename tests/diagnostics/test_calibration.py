@@ -5,6 +5,7 @@ import matplotlib
 import pytest
 import torch
 from sbi.utils import BoxUniform
+from torch.distributions import MultivariateNormal
 
 from sbi_active import (
     ASBI,
@@ -27,17 +28,13 @@ MODEL = SimulatorModel(lambda theta, action: theta * action, noise=GaussianNoise
 class Exact:
     """The exact posterior without the edges, changed at one action."""
 
-    def __init__(self, factor=1.0, at=None):
+    def __init__(self, factor=1.0, at=1.0):
         self.factor, self.at = factor, at
 
     def parts(self, condition):
         x, action = condition[:, :1], condition[:, 1:]
-        sd = 0.2 / action
-        if self.at is not None:
-            wrong = (action - self.at).abs() < 1e-4
-            sd = torch.where(wrong, self.factor * sd, sd)
-        else:
-            sd = self.factor * sd
+        wrong = (action - self.at).abs() < 1e-4
+        sd = 0.2 / action * torch.where(wrong, self.factor, 1.0)
         return torch.distributions.Normal(x / action, sd)
 
     def log_prob(self, theta, condition):
@@ -61,8 +58,6 @@ def trained():
 def with_network(trained, network):
     posterior = trained.build_posterior()
     packed = posterior.packed()
-    network.input_shape = torch.Size([1])
-    network.condition_shape = torch.Size([2])
 
     class Module(torch.nn.Module):
         input_shape, condition_shape = torch.Size([1]), torch.Size([2])
@@ -73,19 +68,17 @@ def with_network(trained, network):
     return ActionPosterior(packed, posterior.x_shape, posterior.action_dim)
 
 
+def check(posterior, **options):
+    given = {"actions": ACTIONS, "num_simulations": 600, **options}
+    return check_calibration(posterior, MODEL, **given)
+
+
 def test_a_right_network_is_trusted_and_a_wrong_one_flagged(trained):
-    right = check_calibration(
-        with_network(trained, Exact()), MODEL, actions=ACTIONS, num_simulations=600
-    )
+    right = check(with_network(trained, Exact()))
     assert right.verdict == "trust"
     assert not right.flagged
     assert abs(right.overall.gap) < 0.1
-    narrow = check_calibration(
-        with_network(trained, Exact(0.4, at=1.0)),
-        MODEL,
-        actions=ACTIONS,
-        num_simulations=600,
-    )
+    narrow = check(with_network(trained, Exact(0.4)))
     assert narrow.flagged == ["gain 1"]
     assert narrow.verdict == "stop"
 
@@ -97,13 +90,7 @@ def test_a_blunt_network_passes_ranks_and_not_the_gap(trained):
             return torch.distributions.Uniform(low, -low, validate_args=False)
 
     for gap in ("likelihood", "classifier"):
-        found = check_calibration(
-            with_network(trained, Blunt()),
-            MODEL,
-            actions=ACTIONS,
-            num_simulations=600,
-            gap=gap,
-        )
+        found = check(with_network(trained, Blunt()), gap=gap)
         assert found.verdict == "refine"
         assert "blunt" in found.reasons[0]
         low, high = found.overall.coverage_interval
@@ -113,10 +100,7 @@ def test_a_blunt_network_passes_ranks_and_not_the_gap(trained):
 @pytest.mark.parametrize("gap", ["likelihood", "classifier"])
 def test_a_result_says_itself_and_leaves_the_generators_alone(trained, gap):
     before = torch.random.get_rng_state()
-    options = {"num_simulations": 150, "gap": gap}
-    found, again = (
-        check_calibration(trained, MODEL, actions=ACTIONS, **options) for _ in range(2)
-    )
+    found, again = (check(trained, num_simulations=150, gap=gap) for _ in "ab")
     assert found.gap_method == gap
     assert (torch.random.get_rng_state() == before).all()
     assert (found.ranks == again.ranks).all()
@@ -127,14 +111,10 @@ def test_a_result_says_itself_and_leaves_the_generators_alone(trained, gap):
     assert found.verdict != "trust" or found.overall.lost < 0.4
 
 
-class Normal(torch.distributions.MultivariateNormal):
-    """A belief in closed form."""
-
-
 def gaussian(action, x, factor=1.0):
     precision = 1e-4 + (action**2).sum() / 0.04
     mean = (action * x).sum() / 0.04 / precision
-    return Normal(mean.reshape(1), factor**2 / precision.reshape(1, 1))
+    return MultivariateNormal(mean.reshape(1), factor**2 / precision.reshape(1, 1))
 
 
 @pytest.mark.parametrize(
@@ -150,7 +130,7 @@ def gaussian(action, x, factor=1.0):
 def test_a_belief_too_wide_or_narrow_is_flagged(own, every, verdicts):
     action = torch.tensor([[1.0], [2.0]])
     x = torch.tensor([[0.4], [0.9]])
-    prior = Normal(torch.zeros(1), 1e4 * torch.eye(1))
+    prior = MultivariateNormal(torch.zeros(1), 1e4 * torch.eye(1))
     trials = [SimpleNamespace(action=a, x=v) for a, v in zip(action, x, strict=True)]
     belief = gaussian(action, x, own)
     inference = SimpleNamespace(trials=trials, belief=belief, _prior=prior)

@@ -2,19 +2,13 @@
 
 import pytest
 import torch
-from sbi.utils import BoxUniform
 
 from sbi_active import DiscreteActions
 from sbi_active.actions import ActionSpace
 from sbi_active.simulation import check_simulator
+from tests.identifiability.test_known import CENTERED, POSITIVE, box
 
 SPEEDS = DiscreteActions([0.5, 1.0, 2.0, 3.0], names=["speed"])
-POSITIVE, CENTERED = (0.2, 1.0), (-1.0, 1.0)
-
-
-def box(*bounds):
-    low, high = zip(*bounds, strict=True)
-    return BoxUniform(torch.tensor(low), torch.tensor(high))
 
 
 def friction(friction, mass, speed):
@@ -27,8 +21,7 @@ OPEN = {
     "ratio": (lambda a, b, v: torch.sin(v * a / b), [POSITIVE] * 2, ["a / b"]),
     "shift": (friction, [POSITIVE] * 2, ["a * (b + 0.5)"]),
     "exponential": (
-        lambda a, b, v: v * a * torch.exp(-b),
-        [POSITIVE, CENTERED],
+        *(lambda a, b, v: v * a * torch.exp(-b), [POSITIVE, CENTERED]),
         ["a * exp(-b)"],
     ),
     "three": (lambda a, b, c, v: v * a * b / c, [POSITIVE] * 3, ["a * b / c"]),

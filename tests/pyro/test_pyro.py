@@ -171,12 +171,6 @@ def test_a_channel_that_was_not_observed_follows_the_others():
     assert found.probability.isnan().tolist() == [False, True]
 
 
-def test_nothing_observed_leaves_the_predictive():
-    draws = 5.0 + predictive(1_000, 2)
-    found = denoise(torch.full((2,), torch.nan), draws, SPIKES, seed=0)
-    assert float(found.x.mean()) == pytest.approx(5.0, abs=0.2)
-
-
 def test_errors_count_by_their_size():
     x = torch.zeros(1, 2)
     probability = SPIKES.misspecified(x, torch.tensor([0.0, 50.0]))

@@ -1,20 +1,11 @@
 """Noise that a learned likelihood does not follow, and beliefs that say so."""
 
-from dataclasses import replace
-
-import numpy as np
 import pytest
 import torch
 from sbi.utils import BoxUniform
 
 from sbi_active import Campaign, CampaignOptions, DiscreteActions
-from sbi_active.inference.emulation.checks import _of_few
-from sbi_active.inference.emulation.emulator import EmulatedLikelihood
 from sbi_active.inference.emulation.refining import refine
-from sbi_active.inference.emulation.regression import Regression
-from sbi_active.inference.emulation.solving import whole_space
-from sbi_active.inference.emulation.stages import FEW_ROWS
-from sbi_active.inference.sampling.coordinates import PriorCoordinates
 
 PRIOR = BoxUniform(-2 * torch.ones(1), 2 * torch.ones(1))
 
@@ -60,16 +51,3 @@ def test_a_scale_that_depends_on_the_parameters_is_a_doubt(slope, holds):
     found = belief.diagnostics
     assert found.assumptions["even_noise"].holds is holds
     assert found.trustworthy is holds
-
-
-@pytest.mark.parametrize(("misfit", "holds"), [(1.5, True), (1.2, False)])
-def test_of_few_rows_the_loop_decides_how_much_misfit_is_a_doubt(misfit, holds):
-    z = np.linspace(-1, 1, 60)[:, None]
-    noisy = z + 0.1 * np.random.default_rng(0).standard_normal(z.shape)
-    region, none = whole_space(1), np.zeros((0, 2), dtype=int)
-    fit = Regression.fit(region, z, noisy, none, np.zeros(1, dtype=int), np.zeros(1))
-    coordinates = PriorCoordinates(PRIOR, np.random.default_rng(0))
-    part = replace(fit, excess=1.3)
-    learned = EmulatedLikelihood(coordinates, region, (part,), ((0,),))
-    settings = replace(FEW_ROWS, misfit=misfit)
-    assert _of_few(learned, settings, 0.0)["no_misfit"][0] is holds

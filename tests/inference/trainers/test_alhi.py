@@ -17,86 +17,62 @@ from sbi_active.inference.models.factors import Product, trained_region
 from sbi_active.inference.networks.ratio_network import RatioClassifier
 from sbi_active.inference.rounds.rows import Observation
 from sbi_active.inference.sampling.coordinates import PriorCoordinates
-from tests.linear_gaussian import DIM, PRIOR, moments, simulator
+from tests.linear_gaussian import (
+    DIM,
+    PRIOR,
+    divergence,
+    moments,
+    posterior,
+    simulator,
+)
 
 SETTINGS = MixtureDensity(hidden_features=(16,), num_iterations=100)
-TRIALS = [([1.0], [0.7, -0.4]), ([3.0], [1.5, -2.0])]
+ACTION, X = torch.tensor([[1.0], [3.0]]), torch.tensor([[0.7, -0.4], [1.5, -2.0]])
 
 
-def rows(n=1_500):
-    theta, action = PRIOR.sample((n,)), 0.5 + 3 * torch.rand(n, 1)
+def rows(n=1_500, prior=PRIOR):
+    theta, action = prior.sample((n,)), 0.5 + 3 * torch.rand(n, 1)
     return theta, simulator(theta, action), action
 
 
-def trained(seed=0, **options):
-    torch.manual_seed(seed)
-    inference = ALHI(PRIOR, SETTINGS, show_progress_bars=False, **options)
+def trained():
+    inference = ALHI(PRIOR, SETTINGS, show_progress_bars=False)
     theta, x, action = rows()
     inference.append_simulations(theta, x, action=action).train()
     return inference
 
 
-def exact(trials=TRIALS):
-    """Posterior mean and standard deviation of the conjugate product."""
-    action = torch.tensor([a for a, _ in trials])
-    x = torch.tensor([x for _, x in trials])
-    precision = 1 + action.square().sum()
-    return (action * x).sum(0) / precision, precision**-0.5
-
-
-def divergence(belief, trials=TRIALS, n=4_000):
-    """KL(exact || belief) in nats; its standard error is about .02."""
-    mean, sd = exact(trials)
-    posterior = torch.distributions.Independent(
-        torch.distributions.Normal(mean, sd.expand(DIM)), 1
-    )
-    torch.manual_seed(0)
-    theta = posterior.sample((n,))
-    return float((posterior.log_prob(theta) - belief.log_prob(theta)).mean())
-
-
-def observe(inference, trials=TRIALS, **options):
-    for index, (action, x) in enumerate(trials):
-        if index and inference._trained_round is None and "simulator" not in options:
-            theta = inference.belief.sample((1_500,))
-            action_rows = 0.5 + 3 * torch.rand(1_500, 1)
-            inference.append_simulations(
-                theta, simulator(theta, action_rows), action=action_rows
-            ).train()
-        belief = inference.update(
-            torch.tensor(x), action=torch.tensor(action), seed=index, **options
-        )
-    return belief
-
-
 def test_the_belief_is_the_product_over_the_history():
-    belief = observe(trained())
+    inference = trained()
+    inference.update(X[0], action=ACTION[0], seed=0)
+    theta, x, action = rows(prior=inference.belief)
+    inference.append_simulations(theta, x, action=action).train()
+    belief = inference.update(X[1], action=ACTION[1], seed=1)
+    exact = posterior(ACTION, X)
     # 1,350 rows fix a coefficient of f to .03 noise deviations; twice two trials.
-    assert abs(divergence(belief)) < 0.05
-    mean, sd = exact()
-    assert belief.mean.tolist() == pytest.approx(mean.tolist(), abs=0.15 * float(sd))
-    # A belief of the last trial alone is far from it.
-    assert divergence(belief, TRIALS[:1]) > 0.5
+    assert abs(divergence(belief, exact)) < 0.05
+    sd = float(exact.stddev[0])
+    assert belief.mean.tolist() == pytest.approx(exact.mean.tolist(), abs=0.15 * sd)
+    # A belief of one trial alone is far from it.
+    assert divergence(belief, posterior(ACTION[:1], X[:1])) > 0.5
 
 
 def test_the_product_is_sbi_s_condition_on_theta():
     inference = trained()
     model = inference.build_posterior()
-    action = torch.tensor([a for a, _ in TRIALS])
-    x = torch.tensor([x for _, x in TRIALS])
-    trials = [Observation(*pair) for pair in zip(action, x, strict=True)]
+    trials = [Observation(*pair) for pair in zip(ACTION, X, strict=True)]
     coordinates = PriorCoordinates(PRIOR, np.random.default_rng(0))
     ours = Product(coordinates, model, trials)
-    potential, _ = likelihood_estimator_based_potential(model.estimator, PRIOR, x)
-    theirs = potential.condition_on_theta(action, dims_global_theta=[0, 1])
+    potential, _ = likelihood_estimator_based_potential(model.estimator, PRIOR, X)
+    theirs = potential.condition_on_theta(ACTION, dims_global_theta=[0, 1])
     theta = PRIOR.sample((20,))
     with torch.no_grad():
-        expected = theirs(theta, x_o=x).double()
+        expected = theirs(theta, x_o=X).double()
         assert ours.log_factors(theta).tolist() == pytest.approx(
             expected.tolist(), rel=1e-4, abs=1e-3
         )
-        table = model.log_likelihood_table(x, theta, action[0])
-        row = model.log_likelihood(x[:1].expand(20, -1), theta, action[:1])
+        table = model.log_likelihood_table(X, theta, ACTION[0])
+        row = model.log_likelihood(X[:1].expand(20, -1), theta, ACTION[:1])
     assert table[0].tolist() == pytest.approx(row.tolist(), abs=1e-4)
 
 
@@ -257,12 +233,9 @@ def test_seqbed_weighs_particles():
 
 
 def test_amortized_ratios_meet_the_closed_form():
-    torch.manual_seed(0)
     classifier = RatioClassifier(hidden_features=(32,), num_iterations=150)
     inference = SeqBED(PRIOR, classifier, show_progress_bars=False)
-    n = 3_000
-    theta, action = PRIOR.sample((n,)), 0.5 + 2 * torch.rand(n, 1)
-    x = simulator(theta, action)
+    theta, x, action = rows(3_000)
     inference.append_simulations(theta, x, action=action).train()
     model = inference.build_posterior()
     with torch.no_grad():
