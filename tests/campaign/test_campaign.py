@@ -178,13 +178,6 @@ def test_narrow_and_wide_priors_that_float32_holds(scale):
 # When a round's network is trained, what asks it, and the posterior handed out
 
 
-def one_round(c):
-    action = c.ask().action
-    c.tell(0.7 * action)
-    c.update()
-    return c.history[-1]
-
-
 def test_asking_for_the_posterior_trains_it_and_changes_nothing_else():
     asked, other = campaign("asbi"), campaign("asbi")
     ahead = asked.posterior  # before any trial
@@ -202,11 +195,6 @@ def test_asking_for_the_posterior_trains_it_and_changes_nothing_else():
     assert torch.equal(draws(asked), draws(other))
     with pytest.warns(RenamedWarning, match="network_used_by goes in the next version"):
         assert asked.history[0].network_used_by == ()
-
-
-@pytest.mark.parametrize("changes", [{"estimator": "posterior"}, {"refine": False}])
-def test_on_demand_it_is_trained_for_what_needs_it(changes):
-    assert "training" in one_round(campaign("asbi", **changes)).cpu_seconds
 
 
 # A campaign on parameters that no action tells apart

@@ -158,24 +158,13 @@ def test_an_odd_call(files, capfd, status, text, words):
         read(shown.out)
 
 
-@pytest.mark.parametrize("text", ["-.5e2"])
-def test_numbers_may_begin_with_a_minus(files, text):
+def test_numbers_may_begin_with_a_minus(files):
     words = ["--actions", "-2:2", "--simulator", "sled.py:slide"]
     assert main(["init", "new", *BOX, *SMALL, *words]) == 0
-    assert main(["tell", "new", text, "--action", "-1e-1"]) == 0
+    assert main(["tell", "new", "-.5e2", "--action", "-1e-1"]) == 0
     (trial,) = Campaign.load("new").history
     assert trial.action.tolist() == pytest.approx([-0.1])
-    assert trial.x.tolist() == pytest.approx([float(text)])
-
-
-def test_what_is_refused_changes_nothing(files):
-    before = [(t.status, t.x) for t in Campaign.load(files).history]
-    for words in (
-        ["tell", "camp", "O"],
-        ["correct", "camp", "0", "--file", "unit.csv"],
-    ):
-        assert main(words) == 2
-    assert [(t.status, t.x) for t in Campaign.load(files).history] == before
+    assert trial.x.tolist() == [-50.0]
 
 
 def test_numbers_that_are_not_finite_are_null(camp, capfd, monkeypatch):

@@ -6,7 +6,9 @@ from importlib.metadata import version
 from pathlib import Path
 
 import arviz as az
+import pandas as pd
 import pytest
+from matplotlib import image
 
 from sbi_active.cli import main, problem
 from tests.cli.sled import SMALL, read
@@ -88,3 +90,17 @@ def test_python_has_the_command_line():
     command = [sys.executable, "-m", "sbi_active", "--version"]
     shown = subprocess.run(command, capture_output=True, text=True, check=True)
     assert shown.stdout.strip() == version("sbi-active")
+
+
+# A task's campaign
+
+
+def test_run_writes_table_and_figure(capsys):
+    words = ["run", "numerical", "--rounds", "2", "--out", "a"]
+    assert main([*words, "--set", "num_simulations=200"]) == 0
+    printed = capsys.readouterr().out
+    assert "the truth: " in printed
+    assert "a/loop.png" in printed
+    assert len(pd.read_csv("a/trials.csv")) == 2
+    assert "sbi-active ask a/campaign" in printed
+    assert image.imread("a/loop.png").shape[1] == 1320  # of campaign.plot

@@ -1,6 +1,7 @@
 """``sbi-active criticize``: from a file to a report."""
 
 import functools
+import json
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -156,3 +157,26 @@ def test_trials_of_another_shape_than_a_task_s(tmp_path, capsys):
     words = ["criticize", str(tmp_path / "t.csv"), "--task", "ball_drops"]
     assert main(words) == 2
     assert "expected x of 60 samples" in capsys.readouterr().err
+
+
+# ``sbi-active gate``: a decision for a CI, by its exit status
+
+
+def test_a_ci_reads_the_exit_status_and_the_reason(capsys):
+    speeds = [2.5, 0.5, 3.0, 1.0, 2.0, 1.5, 2.75, 1.25]
+    errors = [2, -3, 4, -6, 5, -1, 3, -4]  # mm
+    rows = []
+    for k, (v, e) in enumerate(zip(speeds, errors, strict=True)):
+        distance = v**2 / (19.62 * 0.4) + e / 1e3
+        rows.append(f"{v},{distance:.4f},{'held out' if k > 4 else 'fit'}")
+    write(rows, "action_speed[m/s],x_distance[m],role")
+    Path("sled.py").write_text(ROBOT[: ROBOT.index("effects")])
+    command = ["gate", "trials.csv", "--simulator", "sled.py:distance", *OPTIONS]
+    assert main([*command, "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found["decision"] == "SHIP"
+    assert found["details"]["before"] < 0.02
+    assert main([*command, "--theta-high=0.3", "--json"]) == 12
+    found = json.loads(capsys.readouterr().out)
+    assert found["decision"] == "OUT_OF_PRIOR"
+    assert abs(found["details"]["bounds"][0]["bound"] - 0.3) < 1e-6

@@ -174,8 +174,3 @@ def test_a_file_that_is_damaged_meanwhile_is_said(camp):
         status, text = refused(url)
         assert status == 503
         assert "with another checksum" in text
-
-
-def test_what_is_no_campaign_is_said(capsys):
-    assert main(["watch", "nowhere"]) == 2
-    assert "expected a campaign; got no nowhere" in capsys.readouterr().err

@@ -1,7 +1,7 @@
 """Batches and pending trials against the linear-Gaussian closed form."""
 
-import pytest
 import torch
+from torch.distributions import MultivariateNormal
 
 from sbi_active import (
     AutocorrelatedNoise,
@@ -10,7 +10,7 @@ from sbi_active import (
     InformationGainDesigner,
     SimulatorModel,
 )
-from tests.linear_gaussian import PRIOR, log_normal
+from tests.linear_gaussian import PRIOR
 
 ANGLES = DiscreteActions([0.0, 0.25, 1.0], names=["angle"])
 
@@ -34,18 +34,9 @@ def joint(*actions):
 MODEL = SimulatorModel(along, noise=GaussianNoise(1.0))
 
 
-class Likelihood:
-    """The exact likelihood of it."""
-
-    exact_likelihood = True
-
-    def log_likelihood(self, x, theta, action):
-        return log_normal(x - along(theta, action), 1.0)
-
-
-def select(model=None, simulator=MODEL, estimator="auto", **options):
-    designer = InformationGainDesigner(ANGLES, num_samples=1_000, estimator=estimator)
-    return designer.select(model, simulator, belief=PRIOR, seed=0, **options)
+def select(simulator=MODEL, **options):
+    designer = InformationGainDesigner(ANGLES, num_samples=1_000)
+    return designer.select(None, simulator, belief=PRIOR, seed=0, **options)
 
 
 def test_a_batch_is_chosen_by_joint_information():
@@ -69,18 +60,14 @@ def test_a_batch_is_chosen_by_joint_information():
     assert repr(design).startswith("Design(2 actions, joint EIG 2.")
 
 
-@pytest.mark.parametrize(
-    ("estimator", "model"), [("auto", None), ("likelihood", Likelihood())]
-)
-def test_pending_trials_count_as_known(estimator, model):
-    design = select(model, estimator=estimator, pending=torch.tensor([[0.0]]))
+def test_pending_trials_count_as_known():
+    design = select(pending=torch.tensor([[0.0]]))
     assert design.action.tolist() == [1.0]
     assert design.bound == "none"
     given = torch.tensor([joint(0.0, float(a)) - joint(0.0) for a in ANGLES.values])
     distance = (design.expected_information_gain - given).abs()
     assert (distance < 4 * design.standard_error + 0.1).all()
-    both = torch.tensor([[0.0], [1.0]])
-    third = select(model, estimator=estimator, pending=both)
+    third = select(pending=torch.tensor([[0.0], [1.0]]))
     assert float(third.expected_information_gain.max()) < 1.0  # both directions known
 
 
@@ -97,3 +84,36 @@ def test_joint_noise_keeps_its_time_axis():
     exact = 0.5 * float(logdet[0] - logdet[1])
     gain = float(design.expected_information_gain[design.index])
     assert abs(gain - exact) < 4 * float(design.standard_error[design.index]) + 0.1
+
+
+# Outcomes with many numbers, compared by a few summaries of them
+
+
+NUM = 300
+TIMES = torch.linspace(0.1, 1.0, NUM)
+BELIEF = MultivariateNormal(torch.zeros(2), torch.eye(2))
+BASIS = torch.stack([TIMES, torch.sin(8 * TIMES)])
+
+
+def line(theta, action):
+    return action * (theta @ BASIS)
+
+
+def exact(action: float, sd: float) -> float:
+    precision = torch.eye(2) + (action / sd) ** 2 * BASIS @ BASIS.T
+    return 0.5 * float(torch.logdet(precision.double()))
+
+
+def test_a_linear_model_tells_what_it_tells_in_closed_form():
+    model = SimulatorModel(line, noise=GaussianNoise(2.0))
+    actions = DiscreteActions([0.2, 1.0, 3.0])
+    designer = InformationGainDesigner(actions, num_samples=1_000)
+    design = designer.select(None, model, belief=BELIEF, seed=0)
+    error = design.standard_error.nan_to_num(0.0)
+    for k, action in enumerate((0.2, 1.0, 3.0)):
+        gain = float(design.expected_information_gain[k])
+        assert abs(gain - exact(action, 2.0)) < 4 * float(error[k]) + 0.03
+    assert float(design.action) == 3.0
+    assert any(
+        "32 linear summaries stand for the 300 numbers" in n for n in design.notes
+    )

@@ -3,10 +3,11 @@
 import doctest
 import importlib
 import inspect
+import re
 
 import pytest
 
-from tests.docs import extension
+from tests.docs import ROOT, extension
 
 #: Names that need an extra, and the attribute of a module that it brings.
 OPTIONAL = {
@@ -58,3 +59,25 @@ def test_every_name_has_one(package):
     ]
     assert sorted(blocks) == sorted(without)
     assert all(">>> " in block for block in blocks.values())
+
+
+# What benchmarks print becomes tables of the site, from committed rows
+
+
+pytest.importorskip("sphinx")
+page = extension("results")
+
+
+def test_each_section_shows_its_tables():
+    text = (ROOT / "docs" / "benchmarks.md").read_text(encoding="utf-8")
+    included = re.findall(r"{include} reference/api/results/(.+)", text)
+    assert included == [
+        page.file_of(t).name for t in re.findall("## (.+)", text) if t in page.TABLES
+    ]
+    assert {*included} == {page.file_of(title).name for title in page.TABLES}
+
+
+@pytest.mark.parametrize("title", page.TABLES)
+def test_a_section_has_its_tables(title):
+    text = page.tables(page.TABLES[title])
+    assert text.count("```bash") == len(page.TABLES[title])

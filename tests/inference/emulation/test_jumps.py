@@ -11,13 +11,17 @@ from sbi_active import (
     BoxActions,
     Campaign,
     CampaignOptions,
+    DiscreteActions,
     GaussianNoise,
     SimulatorModel,
 )
-from sbi_active.inference.emulation.emulator import emulated
+from sbi_active.inference.emulation.checks import _of_few
+from sbi_active.inference.emulation.emulator import EmulatedLikelihood, emulated
 from sbi_active.inference.emulation.pool import TrialRows
+from sbi_active.inference.emulation.refining import refine
+from sbi_active.inference.emulation.regression import Regression
 from sbi_active.inference.emulation.solving import whole_space
-from sbi_active.inference.emulation.stages import largest_error
+from sbi_active.inference.emulation.stages import FEW_ROWS, largest_error
 from sbi_active.inference.engine.learned import learned_fit
 from sbi_active.inference.sampling.coordinates import PriorCoordinates
 
@@ -82,3 +86,65 @@ def test_the_error_of_a_learned_likelihood_is_what_simulations_say():
     nothing = replace(rows, agrees=np.zeros(len(rows.z), dtype=bool))
     assert largest_error([fit], learned, [nothing], z) == np.inf
     assert largest_error([fit], learned, [rows], z + 1e-3) == np.inf
+
+
+# Noise that a learned likelihood does not follow, and beliefs that say so
+
+
+PRIOR = BoxUniform(-2 * torch.ones(1), 2 * torch.ones(1))
+
+
+def noisy(draw):
+    return lambda theta, xi: theta * xi + 0.3 * draw(theta)
+
+
+NOISES = {
+    "normal": (torch.randn_like, True),
+    "exponential": (
+        lambda t: torch.distributions.Exponential(1.0).sample(t.shape),
+        False,
+    ),
+    "two points": (lambda t: torch.randn_like(t).sign(), False),
+    "varying": (lambda t: torch.exp(1.5 * t) * torch.randn_like(t), False),
+}
+
+
+@pytest.mark.parametrize("name", NOISES)
+def test_few_simulations_tell_noise_that_is_not_normal(name):
+    draw, holds = NOISES[name]
+    options = CampaignOptions(max_simulations=500, planned_trials=3)
+    actions = DiscreteActions([1.0, 2.0])
+    campaign = Campaign(noisy(draw), PRIOR, actions, seed=0, options=options)
+    torch.manual_seed(0)
+    for _ in range(3):
+        action = campaign.ask().action
+        campaign.tell(noisy(draw)(torch.tensor([[0.5]]), action[None])[0])
+    assert campaign.update().diagnostics.trustworthy is holds
+
+
+@pytest.mark.parametrize(("slope", "holds"), [(0.0, True), (1.0, False)])
+def test_a_scale_that_depends_on_the_parameters_is_a_doubt(slope, holds):
+    """Its mean says nothing, so that the belief would be the prior."""
+
+    def simulator(theta, xi):
+        return 0.3 * theta + torch.exp(slope * theta) * torch.randn_like(theta)
+
+    action, x = torch.ones(3, 1), torch.tensor([[0.1], [-0.1], [0.05]])
+    torch.manual_seed(0)
+    belief = refine(simulator, PRIOR, action, x, seed=0)
+    found = belief.diagnostics
+    assert found.assumptions["even_noise"].holds is holds
+    assert found.trustworthy is holds
+
+
+@pytest.mark.parametrize(("misfit", "holds"), [(1.5, True), (1.2, False)])
+def test_of_few_rows_the_loop_decides_how_much_misfit_is_a_doubt(misfit, holds):
+    z = np.linspace(-1, 1, 60)[:, None]
+    noisy = z + 0.1 * np.random.default_rng(0).standard_normal(z.shape)
+    region, none = whole_space(1), np.zeros((0, 2), dtype=int)
+    fit = Regression.fit(region, z, noisy, none, np.zeros(1, dtype=int), np.zeros(1))
+    coordinates = PriorCoordinates(PRIOR, np.random.default_rng(0))
+    part = replace(fit, excess=1.3)
+    learned = EmulatedLikelihood(coordinates, region, (part,), ((0,),))
+    settings = replace(FEW_ROWS, misfit=misfit)
+    assert _of_few(learned, settings, 0.0)["no_misfit"][0] is holds

@@ -65,13 +65,9 @@ def test_expected_error_is_the_mean_divergence(num: int):
 
 def test_distant_simulations_count_where_the_response_is_simple():
     rng = np.random.default_rng(0)
-    z = np.concatenate(
-        [0.1 * rng.standard_normal((200, 1)), rng.uniform(-1, 1, (200, 1))]
-    )
-    region, none = (
-        around(0.03 * rng.standard_normal((500, 1))),
-        np.zeros((0, 2), dtype=int),
-    )
+    near, far = 0.1 * rng.standard_normal((200, 1)), rng.uniform(-1, 1, (200, 1))
+    z, none = np.concatenate([near, far]), np.zeros((0, 2), dtype=int)
+    region = around(0.03 * rng.standard_normal((500, 1)))
     reaches = {}
     for curve in (lambda z: z, lambda z: np.sign(z) * (np.abs(z) > 0.4) + z):
         x = curve(z) + 0.05 * rng.standard_normal(z.shape)

@@ -16,7 +16,6 @@ from sbi_active.inference.engine.surface import (
     Screened,
     Surface,
     SurfacePotential,
-    features,
     fitted_surface,
 )
 from sbi_active.inference.sampling.least_squares import descend
@@ -45,11 +44,6 @@ def evidence_of_bent(sd, bend, num=400_000):
         u[:, k] = sums[:, k] - bend * u[:, k - 1] ** 2
     log_prior = -0.5 * (u**2).sum(1) - 3 * np.log(2 * np.pi)
     return float(logsumexp(log_prior) - np.log(num))
-
-
-def test_features_are_all_products():
-    z = np.array([[2.0, 3.0]])
-    assert features(z, 3)[0].tolist() == [1, 2, 3, 4, 6, 9, 8, 12, 18, 27]
 
 
 def test_a_polynomial_response_is_predicted_where_no_draw_was():
