@@ -17,6 +17,8 @@ from sbi_active import (
     SimulatorModel,
     StopRules,
 )
+from sbi_active.actions import SignalActions
+from sbi_active.actions.waveforms import step
 from sbi_active.campaign.options import CampaignDetails
 from sbi_active.messages import RenamedWarning
 from tests.campaign.problem import ACTIONS, OPTIONS, PRIOR, campaign, draws, noisy
@@ -195,6 +197,36 @@ def test_asking_for_the_posterior_trains_it_and_changes_nothing_else():
     assert torch.equal(draws(asked), draws(other))
     with pytest.warns(RenamedWarning, match="network_used_by goes in the next version"):
         assert asked.history[0].network_used_by == ()
+
+
+# A campaign whose actions are signals that a robot plays
+
+
+def test_signals_are_asked_for_and_learned_from():
+    space = SignalActions(
+        step("voltage", begin=0.1),
+        [0.2, 0.05],
+        [2.0, 0.8],
+        input_times=torch.linspace(0, 1, 21),
+        duration=0.7,
+    )
+
+    def follow(theta, action, *, inputs):
+        return theta[:, :1] * inputs["voltage"] + theta[:, 1:]
+
+    model = SimulatorModel(follow, noise=GaussianNoise(0.02), inputs=space)
+    prior = BoxUniform(torch.tensor([1.0, -1.0]), torch.tensor([5.0, 1.0]))
+    truth = torch.tensor([[3.0, 0.2]])
+    c = Campaign(model, prior, space, options=OPTIONS)
+    trial = c.ask()
+    assert bool(space.contains(trial.action))
+    for k, action in enumerate([trial.action, *space.sample((2,), seed=1)]):
+        c.tell(model(truth, action[None], torch.tensor([k]))[0], action=action)
+    c.update()
+    mean, sd = c.belief.mean, c.belief.stddev
+    assert bool(((mean - truth[0]).abs() < 4 * sd).all())
+    assert bool((sd < 0.05).all())
+    assert c.health == "ok"
 
 
 # A campaign on parameters that no action tells apart

@@ -49,13 +49,8 @@ class Browser:
 
 
 @contextmanager
-def browser(folder: Path, *flags: str):
-    """Yield a browser of its own profile.
-
-    Args:
-        folder: Folder that gets the profile.
-        *flags: Further flags of Chromium.
-    """
+def browser(folder: Path):
+    """Yield a browser whose profile is in a folder."""
     if CHROMIUM is None or DRIVER is None:
         pytest.skip("Chromium and chromedriver are not installed here: nobody watches")
     with socket.socket() as free:
@@ -63,7 +58,7 @@ def browser(folder: Path, *flags: str):
         port = free.getsockname()[1]
     own = [flag for flag in FLAGS if flag.startswith("--") and "dump" not in flag]
     own = [flag for flag in own if "virtual" not in flag and "logging" not in flag]
-    own += [f"--user-data-dir={folder / 'profile'}", *flags]
+    own += [f"--user-data-dir={folder / 'profile'}"]
     driver = subprocess.Popen(
         [DRIVER, f"--port={port}"], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
     )

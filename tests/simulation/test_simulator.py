@@ -55,19 +55,9 @@ BEYOND = [
     lambda t: t.double() + 1e39,
     lambda t: t.double().numpy() - 1e200,
     lambda t: [1e39] * len(t),
-    lambda t: torch.where(t == 2, 1e39, t.double()),
 ]
-COMPLEX = [
-    lambda t: t + 1j,
-    lambda t: t.numpy() + 1j,
-    lambda t: [1j] * len(t),
-    lambda t: np.fft.fft(t.numpy(), axis=0),
-]
-EMPTY = [
-    lambda t: t[:, :0],
-    lambda t: torch.zeros(len(t), 3, 0),
-    lambda t: [[]] * len(t),
-]
+COMPLEX = [lambda t: t + 1j, lambda t: t.numpy() + 1j, lambda t: [1j] * len(t)]
+EMPTY = [lambda t: torch.zeros(len(t), 3, 0), lambda t: [[]] * len(t)]
 
 
 @pytest.mark.parametrize(
@@ -132,9 +122,6 @@ def test_counts_that_are_equal_by_chance_prove_no_missing_noise():
         require_noise(torch.ones(16, 1), torch.ones(16, 1))
     with pytest.raises(ValueError, match="expected a simulator with noise"):
         require_noise(torch.arange(16.0)[:, None], torch.arange(16.0)[:, None])
-
-
-# What users write at first: taken where it is clear, refused early where it is not
 
 
 PRIOR = BoxUniform(torch.zeros(1), torch.ones(1))

@@ -76,7 +76,7 @@ def test_each_method_has_its_authors_utility(method):
 
 
 def test_faithful_seqbed_is_lfire():
-    sizes = {"num_simulations": 900, "refine": False, "estimator": "ratio"}
+    sizes = {"num_simulations": 300, "refine": False, "estimator": "ratio"}
     c = small("seqbed", density_estimator=LFIRE(), **sizes)
     c.run(measured, num_rounds=1)
     assert c.belief.label == "weighted particles"

@@ -20,9 +20,7 @@ from sbi_active.messages import StorageWarning
 from sbi_active.simulation.bank import CorruptSegmentError
 from sbi_active.simulation.bank.store import Store
 from tests.campaign.storage.campaigns import MODEL, PRIOR, draws, facts, go_on, new
-from tests.simulation.bank.filled import crafted, execute, filled, flip
-
-FILE = "store.db"
+from tests.simulation.bank.filled import FILE, crafted, execute, filled, flip
 
 
 @pytest.fixture(scope="module")

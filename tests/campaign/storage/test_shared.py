@@ -12,9 +12,7 @@ from sbi_active.campaign.storage.codec import decode, encode
 from sbi_active.simulation.bank import CorruptSegmentError, store
 from sbi_active.simulation.bank.store import LogChangedError, Store
 from tests.campaign.storage.campaigns import facts, go_on, mean, new
-from tests.simulation.bank.filled import crafted, execute
-
-FILE = "store.db"
+from tests.simulation.bank.filled import FILE, crafted, execute
 
 
 def told(folder, **options):
@@ -147,20 +145,8 @@ def test_a_small_file_that_fills_memory_is_refused():
         decode(bomb, known={})
 
 
-SPOILS = [
-    None,
-    [],
-    {},
-    "",
-    -1,
-    1e300,
-    True,
-    10**9,
-    "\ud800",
-    [[]],
-    {"a": None},
-    [None] * 3,
-]
+SPOILS = [None, [], {}, "", -1, 1e300, True, 10**9]
+SPOILS += ["\ud800", [[]], {"a": None}, [None] * 3]
 
 
 @pytest.mark.filterwarnings("ignore")
