@@ -1,7 +1,5 @@
 """What users bring and get: numbers, keywords, and warnings at their line."""
 
-import re
-
 import numpy as np
 import pytest
 import torch
@@ -53,16 +51,11 @@ def test_what_is_masked_or_none_is_nan():
         assert Trials([0.0, 1.0], given).mask[:, 0].tolist() == [True, False]
 
 
-@pytest.mark.parametrize(
-    ("given", "text"),
-    [
-        ("1.5", "expected speed of real numbers; got '1.5'"),
-        ([[1.0], [2.0, 3.0]], "with rows of one length"),
-    ],
-)
-def test_what_is_no_real_number_is_refused(given, text):
-    with pytest.raises(ValueError, match=re.escape(text)):
-        measured(given, name="speed")
+def test_what_is_no_real_number_is_refused():
+    with pytest.raises(ValueError, match="expected speed of real numbers; got '1.5'"):
+        measured("1.5", name="speed")
+    with pytest.raises(ValueError, match="with rows of one length"):
+        measured([[1.0], [2.0, 3.0]])
 
 
 # Keywords that are mistyped, and what a notebook shows of an object

@@ -73,13 +73,8 @@ TIMES = torch.linspace(0, 2, 201)
 
 
 def chirps(**limits):
-    return SignalActions(
-        chirp("voltage", start_frequency=0.5),
-        [0.5, 1.0],
-        [5.0, 10.0],
-        input_times=TIMES,
-        **limits,
-    )
+    waveform = chirp("voltage", start_frequency=0.5)
+    return SignalActions(waveform, [0.5, 1.0], [5.0, 10.0], input_times=TIMES, **limits)
 
 
 def test_a_chirp_sweeps_its_frequencies():
@@ -120,13 +115,8 @@ def test_only_what_the_robot_can_play_is_permitted():
 
 
 def test_a_signal_may_last_so_long():
-    space = SignalActions(
-        step(amplitude=1.0),
-        [0.0, 0.1],
-        [1.0, 1.9],
-        input_times=TIMES,
-        duration=(0.2, 0.5),
-    )
+    lasting = {"input_times": TIMES, "duration": (0.2, 0.5)}
+    space = SignalActions(step(amplitude=1.0), [0.0, 0.1], [1.0, 1.9], **lasting)
     action = torch.tensor([[0.1, 0.15], [0.1, 0.35], [0.1, 0.6], [0.9, 0.35]])
     assert space.contains(action).tolist() == [False, True, False, True]
 
@@ -141,12 +131,8 @@ def test_a_part_of_a_product_keeps_its_limits():
 
 
 def test_recorded_signals_are_listed():
-    trials = Trials(
-        None,
-        torch.zeros(3, 2),
-        inputs={"u": torch.tensor([[0.0, 1.0], [0.0, 9.0], [0.0, 2.0]])},
-        input_times=[0.0, 0.5],
-    )
+    inputs = {"u": torch.tensor([[0.0, 1.0], [0.0, 9.0], [0.0, 2.0]])}
+    trials = Trials(None, torch.zeros(3, 2), inputs=inputs, input_times=[0.0, 0.5])
     space = SignalActions(recorded(trials), amplitude=5.0)
     listed = space.listed()
     assert listed.tolist() == [[0.0], [2.0]]
@@ -166,11 +152,7 @@ def test_signals_of_several_inputs_are_one_action():
         input_times=TIMES,
         amplitude={"knee": 0.4},
     )
-    assert space.names[:3] == [
-        "hip start frequency",
-        "hip end frequency",
-        "knee amplitude at 1 Hz",
-    ]
+    assert space.names[1:3] == ["hip end frequency", "knee amplitude at 1 Hz"]
     action = torch.tensor([[0.5, 3.0, 0.1, 0.2]])
     played = space.inputs(action)
     alone = chirp("hip", amplitude=0.2)(action[:, :2], TIMES)["hip"]
@@ -183,9 +165,8 @@ def test_signals_of_several_inputs_are_one_action():
 def test_signals_beside_a_category_are_played_by_the_simulator():
     space = MixedActions(chirps(), BoxActions(0.0, 1.0, names=["payload"]))
     action = torch.tensor([[2.0, 4.0, 0.5]])
-    assert torch.equal(
-        space.inputs(action)["voltage"], chirps().inputs(action[:, :2])["voltage"]
-    )
+    alone = chirps().inputs(action[:, :2])["voltage"]
+    assert torch.equal(space.inputs(action)["voltage"], alone)
     assert space.input_times.shape == TIMES.shape
 
     def follow(theta, action, *, inputs, input_times):

@@ -76,12 +76,9 @@ def test_without_a_cost_the_budget_is_a_number_of_trials():
 
 
 def test_costs_that_add_up_to_the_budget_in_float32_are_afforded():
-    c = campaign(
-        "nsbi",
-        actions=DiscreteActions([0.1]),
-        given={"cost": lambda action: action[:, 0]},
-        stop=StopRules(budget=1.0),
-    )
+    given = {"cost": lambda action: action[:, 0]}
+    tenths = DiscreteActions([0.1])
+    c = campaign(actions=tenths, given=given, stop=StopRules(budget=1.0))
     c.run(lambda action: 0.5 * action, num_rounds=20)
     assert len(c.history) == 10
 
@@ -166,9 +163,8 @@ def measure(theta, action):
 
 def information(history):
     r"""Exact information, nats: half of the sum of :math:`\log(1 + n_k s_k^2)`."""
-    count = torch.bincount(
-        torch.stack([t.action[0].long() for t in history]), minlength=5
-    )
+    index = torch.stack([t.action[0].long() for t in history])
+    count = torch.bincount(index, minlength=5)
     return float((count * SCALES**2).log1p().sum() / 2)
 
 

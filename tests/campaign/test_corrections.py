@@ -14,7 +14,6 @@ from sbi_active.simulation import Workers
 from tests.campaign.problem import (
     ACTIONS,
     PRIOR,
-    REFINEMENT,
     campaign,
     draws,
     noisy,
@@ -267,13 +266,9 @@ class Faulty:
 
 @pytest.mark.parametrize("dies", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_a_faulty_simulator_completes_a_campaign(tmp_path, dies):
-    c = campaign(
-        "asbi",
-        Faulty(tmp_path / "killed" if dies else None),
-        network="each round",
-        refinement=REFINEMENT,
-        workers=Workers(2, time_limit=0.05) if dies else Workers(),
-    )
+    faulty = Faulty(tmp_path / "killed" if dies else None)
+    workers = Workers(2, time_limit=0.05) if dies else Workers()
+    c = campaign("asbi", faulty, network="each round", workers=workers)
     with pytest.warns(UserWarning, match="are missing"):
         c.run(lambda action: 0.6 * action, num_rounds=2 if dies else 1)
     assert (tmp_path / "killed").exists() == dies

@@ -24,12 +24,9 @@ def _closed():
 def folder(tmp_path_factory):
     """A folder with two trials and a missing one; the third is pending."""
     path = tmp_path_factory.mktemp("shown") / "c"
-    named = SimulatorModel(
-        MODEL.fn,
-        noise=MODEL.noise,
-        parameter_names=["a", "b"],
-        channel_names=["left", "right", "up", "down"],
-    )
+    names = {"parameter_names": ["a", "b"]}
+    names |= {"channel_names": ["left", "right", "up", "down"]}
+    named = SimulatorModel(MODEL.fn, noise=MODEL.noise, **names)
     speeds = DiscreteActions([0.5, 1.0, 2.0], names=["speed"], units=["m/s"])
     with go_on(Campaign(named, PRIOR, speeds, options=OPTIONS, directory=path), 2) as c:
         c.ask()

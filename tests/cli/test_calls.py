@@ -104,11 +104,7 @@ CALLS = [
             ("expected num_workers", "--set workers.num_workers=0"),
         )
     ),
-    (
-        2,
-        "of class Distribution; got float",
-        [*OF[:2], "--simulator", "odd.py:loud", *ASK],
-    ),
+    (2, "Distribution; got float", [*OF[:2], "--simulator", "odd.py:loud", *ASK]),
     (2, "as in --simulator my_robot.py:fn", ["init", "new", *BOX]),
     # Programs.
     *(
@@ -229,9 +225,7 @@ def test_interrupted_while_it_simulates():
     assert "Traceback" not in error
 
 
-def test_a_module_of_the_current_folder_comes_before_an_installed_one(
-    tmp_path, monkeypatch
-):
+def test_a_module_of_the_current_folder_comes_first(tmp_path, monkeypatch):
     (tmp_path / "tabnanny.py").write_text("NUMBER = 3\n")
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "path", [*sys.path, str(tmp_path)])

@@ -79,13 +79,6 @@ def test_the_log_and_the_answers_are_the_campaign_s(camp, series, capsys, monkey
     assert repr(one) == repr(other)
 
 
-def test_a_trial_that_somebody_else_told_is_seen(camp, capsys):
-    with Campaign.load("camp") as campaign:
-        campaign.tell([0.2, 0.4], trial=1)
-    assert main(["status", "camp", "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["not_in_belief"] == [1]
-
-
 @pytest.mark.parametrize("content", ["", "[]", '{"of": 1}', "[" * 99_999])
 def test_a_summary_that_is_none_is_not_asked(camp, content, capsys):
     forget(camp, content.encode())

@@ -75,12 +75,6 @@ def test_reading_imports_nothing(mine, words):
     assert "mine" not in sys.modules
 
 
-def test_what_was_named_is_remembered_wherever_one_stands(mine, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path.parent)
-    assert main(["ask", str(tmp_path / "camp"), "--target", "weather"]) == 2
-    assert mine.exists()  # it was imported
-
-
 def test_a_module_is_looked_for_where_it_was_named(mine, tmp_path, monkeypatch):
     assert main(["init", "new", "--simulator", "mine:slide", *SMALL]) == 0
     forget(mine)

@@ -26,9 +26,8 @@ def falls_off(theta, action):
 
 
 def test_a_measurement_that_is_too_improbable_excludes_an_action():
-    designer = InformationGainDesigner(
-        ACTIONS, num_samples=2_000, estimator="posterior"
-    )
+    sizes = {"num_samples": 2_000, "estimator": "posterior"}
+    designer = InformationGainDesigner(ACTIONS, **sizes)
 
     class Model(ExactModel):
         def log_posterior(self, theta, x, action):
@@ -48,9 +47,7 @@ def test_a_measurement_that_is_too_improbable_excludes_an_action():
     assert safe.expected_information_gain.isfinite().all()
     (note,) = safe.notes
     assert note.startswith("1 of 4 candidates excluded: a measurement is less probable")
-    only_hard = InformationGainDesigner(
-        DiscreteActions([1.5, 2.0]), num_samples=400, estimator="posterior"
-    )
+    only_hard = InformationGainDesigner(DiscreteActions([1.5, 2.0]), **sizes)
     with pytest.raises(ValueError, match=r"at least 0.9; got 0\.5\d* at most"):
         only_hard.select(Model(), falls_off, min_probability_valid=0.9, seed=0)
 

@@ -103,13 +103,9 @@ def test_given_simulations_are_of_a_list():
 
 def test_random_choices_of_any_space():
     mixed = MixedActions(BOX, DiscreteActions([0.0, 1.0]))
-    drawn = torch.stack(
-        [RandomDesigner(mixed).select(seed=s).action for s in range(400)]
-    )
-    assert mixed.contains(drawn).all()
-    share = drawn[:, 0] / 2
-    assert abs(float(share.mean()) - 0.5) < 4 * (1 / 12 / 400) ** 0.5
-    assert abs(float(drawn[:, 1].mean()) - 0.5) < 4 * (0.25 / 400) ** 0.5
+    drawn = [RandomDesigner(mixed).select(seed=s).action for s in range(20)]
+    assert mixed.contains(torch.stack(drawn)).all()
+    assert [len({float(a[k]) for a in drawn}) for k in range(2)] == [20, 2]
     design = RandomDesigner(mixed).select(seed=0, constraint=lambda a: a[:, 0] > 1.5)
     assert float(design.action[0]) > 1.5
     with pytest.raises(ValueError, match="permits a part of BoxActions"):

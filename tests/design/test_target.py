@@ -7,9 +7,9 @@ import torch
 from torch.distributions import MultivariateNormal
 
 from sbi_active import DiscreteActions, GaussianNoise, InformationGainDesigner
-from sbi_active.criticism import Effect
 from sbi_active.criticism.effects.augmented import AugmentedSimulator
 from sbi_active.simulation import SimulatorModel
+from tests.effects import added
 from tests.linear_gaussian import PRIOR
 
 SIDES = DiscreteActions([0.0, 1.0], names=["side"])
@@ -28,10 +28,8 @@ MODEL = SimulatorModel(
 )
 
 
-def select(
-    target, *, actions=SIDES, model=MODEL, belief=PRIOR, num_samples=400, **options
-):
-    designer = InformationGainDesigner(actions, num_samples=num_samples, **options)
+def select(target, *, model=MODEL, belief=PRIOR, **options):
+    designer = InformationGainDesigner(SIDES, num_samples=400, **options)
     return designer.select(None, model, belief=belief, target=target, seed=0)
 
 
@@ -43,24 +41,13 @@ def test_a_linear_function_of_a_parameter_is_the_parameter(estimator, name, plac
     by_value = select(lambda theta: 1 - 3 * theta[:, place], estimator=estimator)
     assert by_value.action.tolist() == by_name.action.tolist() == [float(place)]
     assert by_value.estimator == by_name.estimator
-    torch.testing.assert_close(
-        by_value.expected_information_gain,
-        by_name.expected_information_gain,
-        rtol=0,
-        atol=1e-6 if estimator == "linear" else 0.03,  # of the marginal's entropy
-    )
+    gains = by_value.expected_information_gain, by_name.expected_information_gain
+    most = 1e-6 if estimator == "linear" else 0.03  # of the marginal's entropy
+    torch.testing.assert_close(*gains, rtol=0, atol=most)
 
 
 def test_a_function_of_an_effect():
-    drag = Effect(
-        "drag",
-        hook="observation",
-        prior=ONE,
-        null=0.0,
-        apply=lambda x, phi, action, context: x + 6 * phi * action,
-        units="",
-    )
-    model = AugmentedSimulator(MODEL, [drag])
+    model = AugmentedSimulator(MODEL, [added("drag", lambda action: 6 * action)])
     belief = MultivariateNormal(torch.zeros(3), torch.eye(3))
     seen = []
 
@@ -72,23 +59,16 @@ def test_a_function_of_an_effect():
     assert design.action.tolist() == [1.0]
     assert all(each == (2, ["drag"], 1) for each in seen)
     plain = select(lambda theta: theta[:, 2], model=model, belief=belief)
-    assert torch.equal(
-        plain.expected_information_gain, design.expected_information_gain
-    )
+    gain = design.expected_information_gain
+    assert torch.equal(plain.expected_information_gain, gain)
 
 
 def test_a_failure_or_none():
     """The sign of theta: log 2 at most, and next to nothing from a weak action."""
-    model = SimulatorModel(
-        lambda theta, action: action * theta, noise=GaussianNoise(1.0)
-    )
-    design = select(
-        lambda theta: (theta[:, 0] > 0).float(),
-        actions=DiscreteActions([0.1, 100.0]),
-        model=model,
-        belief=ONE,
-        num_samples=1_500,
-    )
+    model = SimulatorModel(lambda t, a: a * t, noise=GaussianNoise(1.0))
+    designer = InformationGainDesigner(DiscreteActions([0.1, 100.0]), num_samples=1_500)
+    given = {"belief": ONE, "target": lambda theta: (theta[:, 0] > 0).float()}
+    design = designer.select(None, model, **given, seed=0)
     weak, strong = design.expected_information_gain.tolist()
     assert abs(weak) < 0.05
     error = float(design.standard_error[1])

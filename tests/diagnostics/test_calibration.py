@@ -134,9 +134,8 @@ def test_a_belief_too_wide_or_narrow_is_flagged(own, every, verdicts):
     trials = [SimpleNamespace(action=a, x=v) for a, v in zip(action, x, strict=True)]
     belief = gaussian(action, x, own)
     inference = SimpleNamespace(trials=trials, belief=belief, _prior=prior)
-    found = check_belief(
-        inference, MODEL, infer=lambda a, x, _: gaussian(a, x, every), num_repeats=60
-    )
+    again = {"infer": lambda a, x, _: gaussian(a, x, every), "num_repeats": 60}
+    found = check_belief(inference, MODEL, **again)
     assert found.verdict in verdicts, found
     assert json.dumps(found.to_dict())
     assert str(found).startswith(found.verdict)
@@ -151,9 +150,8 @@ def test_a_continuum_of_actions_and_invalid_rows(trained):
 
     model = SimulatorModel(fails, noise=GaussianNoise(0.2))
     posterior = with_network(trained, Exact())
-    found = check_calibration(
-        posterior, model, actions=space, num_simulations=400, max_strata=3
-    )
+    sizes = {"num_simulations": 400, "max_strata": 3}
+    found = check_calibration(posterior, model, actions=space, **sizes)
     assert len(found.strata) == 3
     assert found.strata[-1].name.startswith("near gain")
     assert found.num_invalid > 10

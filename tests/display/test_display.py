@@ -9,12 +9,7 @@ import torch
 from attrs import evolve
 from sbi.utils import BoxUniform
 
-from sbi_active import (
-    Campaign,
-    DiscreteActions,
-    GaussianNoise,
-    SimulatorModel,
-)
+from sbi_active import Campaign, DiscreteActions, GaussianNoise, SimulatorModel
 from sbi_active.display import Page, Section, Table
 from sbi_active.display.campaign_page import page as campaign_page
 from sbi_active.display.figures import legible
@@ -39,10 +34,9 @@ def test_a_table_stands_in_columns():
 
 
 def test_a_data_frame_is_shown_without_what_is_not_known():
-    frame = pd.DataFrame(
-        {"trial": [0, 1], "gain": [0.123456, float("nan")], "none": [float("nan")] * 2}
-    )
-    table = Table.of(frame)
+    nan = float("nan")
+    rows = {"trial": [0, 1], "gain": [0.123456, nan], "none": [nan] * 2}
+    table = Table.of(pd.DataFrame(rows))
     assert table.header == ["trial", "gain"]
     assert table.rows == [["0", "0.1235"], ["1", ""]]
 
@@ -62,12 +56,8 @@ NAMES = ["cost [$] \x07", "half \ud800", "a$b$c\\frac{"]
 
 
 def test_any_name_can_be_drawn_and_read(tmp_path):
-    model = SimulatorModel(
-        lambda theta, action: theta * action,
-        noise=GaussianNoise(0.1),
-        parameter_names=NAMES,
-        channel_names=NAMES,
-    )
+    named = {"parameter_names": NAMES, "channel_names": NAMES}
+    model = SimulatorModel(lambda t, a: t * a, noise=GaussianNoise(0.1), **named)
     prior = BoxUniform(torch.zeros(3), torch.ones(3))
     actions = DiscreteActions(torch.eye(3) + 1, names=NAMES, units=["$"] * 3)
     options = evolve(OPTIONS, network="on demand")
@@ -109,9 +99,8 @@ def page_of(thing):
 
 @pytest.fixture(scope="module")
 def campaign():
-    model = SimulatorModel(
-        MODEL.fn, noise=MODEL.noise, parameter_names=["mass", EVIL[:8]]
-    )
+    names = ["mass", EVIL[:8]]
+    model = SimulatorModel(MODEL.fn, noise=MODEL.noise, parameter_names=names)
     actions = DiscreteActions([0.5, 2.0], names=[f"speed {EVIL}"], units=["m/s"])
     options = evolve(OPTIONS, network="on demand")
     c = Campaign(model, PRIOR, actions, options=options)
@@ -135,16 +124,9 @@ def test_a_campaign_has_its_health_belief_and_trials(campaign):
 
 
 def test_pieces_are_escaped():
-    pieces = [
-        card(EVIL),
-        card("title", EVIL),
-        table(Table([EVIL], [[EVIL]])),
-        badge(EVIL),
-        facts([(EVIL, EVIL)]),
-        items([EVIL]),
-        table(Table.of_parameters([EVIL], torch.randn(20, 1))),
-    ]
-    for piece in pieces:
+    tables = Table([EVIL], [[EVIL]]), Table.of_parameters([EVIL], torch.randn(20, 1))
+    pieces = [card(EVIL), card("title", EVIL), badge(EVIL), items([EVIL])]
+    for piece in [*pieces, facts([(EVIL, EVIL)]), *map(table, tables)]:
         assert EVIL in shown(piece).texts
 
 

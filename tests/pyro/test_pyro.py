@@ -45,13 +45,11 @@ def test_names_supports_and_noise():
     assert problem.parameter_names == ["rate", "start"]
     assert isinstance(problem.simulator.noise, GaussianNoise)
     assert float(problem.simulator.noise.sd.max()) == pytest.approx(0.2)
-    assert problem.prior.support.check(
-        torch.tensor([[1.0, -5.0], [-1.0, 0.0]])
-    ).tolist() == [True, False]
+    inside = problem.prior.support.check(torch.tensor([[1.0, -5.0], [-1.0, 0.0]]))
+    assert inside.tolist() == [True, False]
     theta = torch.tensor([[0.5, 1.0]])
-    exact = dist.LogNormal(-1.0, 0.4).log_prob(torch.tensor(0.5)) + dist.Normal(
-        0.0, 1.0
-    ).log_prob(torch.tensor(1.0))
+    parts = dist.LogNormal(-1.0, 0.4), dist.Normal(0.0, 1.0)
+    exact = sum(p.log_prob(v) for p, v in zip(parts, theta[0], strict=True))
     assert float(problem.prior.log_prob(theta)) == pytest.approx(float(exact))
     mean = problem.simulator.mean(theta, torch.tensor([[3.0]]))
     assert float(mean) == pytest.approx(2.5)
@@ -121,9 +119,8 @@ def test_a_first_trial_of_any_kind_leaves_a_belief(x):
         theta, action = prior.sample((2_000,)), torch.rand(2_000, 1)
         rows = simulator(theta, action)
         inference.append_simulations(theta, rows, action=action).train()
-    belief = inference.update(
-        torch.tensor(x), action=torch.ones(1), simulator=simulator, seed=0
-    )
+    told = {"action": torch.ones(1), "simulator": simulator, "seed": 0}
+    belief = inference.update(torch.tensor(x), **told)
     draws = belief.sample((1_000,))
     probability = inference.denoised[-1].probability.nan_to_num(0.0)
     if x[0] == 0.3:

@@ -189,9 +189,8 @@ def test_effects_of_rows_may_be_changed():
     effect = torch.zeros(4, 1, dtype=torch.float64)
     model = SimulatorModel(fn, batched=False, noise=GaussianNoise(1.0))
     for _ in range(2):
-        assert torch.equal(
-            model.mean(THETA[:4], ACTION[:4], gain=effect) - 1, THETA[:4]
-        )
+        mean = model.mean(THETA[:4], ACTION[:4], gain=effect)
+        assert torch.equal(mean - 1, THETA[:4])
 
 
 def test_noise_keeps_the_values_that_were_declared():

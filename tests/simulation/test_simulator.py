@@ -110,9 +110,8 @@ def test_one_number_a_row_needs_no_axis():
     for num_rows in (1, 2, 300):
         ones = torch.ones(num_rows, 1)
         assert model.mean(ones, ones).shape == (num_rows, 1)
-    assert Campaign(
-        model, BoxUniform(torch.zeros(1), torch.ones(1)), DiscreteActions([1.0])
-    ).x_shape == (1,)
+    prior = BoxUniform(torch.zeros(1), torch.ones(1))
+    assert Campaign(model, prior, DiscreteActions([1.0])).x_shape == (1,)
 
 
 def test_counts_that_are_equal_by_chance_prove_no_missing_noise():

@@ -28,10 +28,11 @@ OPTIONS = evolve(problem.OPTIONS, details=CampaignDetails(num_scored=400))
 SHIFT = 0.8
 
 
-DRIFT = on_outcomes(
-    "drift", lambda x, phi, action, context: x + phi * context.index[:, None]
-)
-LIBRARY = [BIAS, DRIFT]
+def drifting(x, phi, action, context):
+    return x + phi * context.index[:, None]
+
+
+LIBRARY = [BIAS, on_outcomes("drift", drifting)]
 
 
 def campaign(effects=(BIAS,), method="asbi", *, constraint=None, **changes):

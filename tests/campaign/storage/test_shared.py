@@ -115,11 +115,8 @@ def test_a_log_shorter_than_the_state_is_damage(tmp_path, harm):
 
 def test_small_numbers_are_corrected(tmp_path):
     scale = 1e-9
-    model = SimulatorModel(
-        lambda theta, action: scale * mean(theta, action),
-        noise=GaussianNoise(0.1 * scale),
-    )
-    c = new(tmp_path / "c", model)
+    noise = GaussianNoise(0.1 * scale)
+    c = new(tmp_path / "c", SimulatorModel(lambda *p: scale * mean(*p), noise=noise))
     c.attach([1.0], [0.8 * scale] * 4)
     c.correct(0, [2.0 * scale] * 4, reason="typo")
     assert c.history[0].x.tolist() == pytest.approx([2 * scale] * 4, rel=1e-6)

@@ -81,12 +81,8 @@ def test_gone_on_with_to_the_last_bit(folder):
     with Campaign.load(folder, simulator=simulator) as campaign:
         require_trials(campaign)
         draws = finished(campaign)
-    anew = Campaign(
-        *(simulator, campaign.first_prior, campaign.actions),
-        method="nsbi",
-        options=campaign.state.options,
-        seed=1,
-    )
+    given = {"method": "nsbi", "options": campaign.state.options, "seed": 1}
+    anew = Campaign(simulator, campaign.first_prior, campaign.actions, **given)
     anew.attach([1.0], [0.31, 0.62, 0.9])
     anew.attach([2.0], [62.0, 88.0, 121.0])
     anew.correct(1, [0.62, 0.88, 1.21], reason="told in cm")

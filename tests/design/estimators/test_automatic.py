@@ -65,9 +65,8 @@ def test_many_parameters_that_outcomes_are_linear_in_have_the_linear_estimate(
     theta, slope = torch.rand(n, dim).double(), 9 * torch.rand(dim, 2).double()
     mean = (theta @ slope + bend * torch.sin(theta @ slope))[None]
     x = mean + torch.randn(mean.shape)
-    given = CandidateSimulations(
-        theta.float(), torch.zeros(1, 1), x, mean, GaussianNoise(1.0)
-    )
+    none, noise = torch.zeros(1, 1), GaussianNoise(1.0)
+    given = CandidateSimulations(theta.float(), none, x, mean, noise)
     chosen, _ = choose_estimator(ExactLikelihood(), given, None)
     assert (type(chosen) is LinearGain) == linear
 
@@ -98,8 +97,7 @@ def test_an_estimate_near_its_limit_is_said_to_be(estimator, text):
     wrong = (gain.mean(1) - information(FAR)).abs()
     assert float(wrong[1]) > 0.5
     assert float(wrong[0]) < 0.2
-    gain = estimator(model, near, PRIOR)
-    assert estimator.cautions(gain) == []
+    assert estimator.cautions(estimator(model, near, PRIOR)) == []
 
 
 def test_a_ratio_whose_normalization_is_off_is_noticed():
@@ -124,14 +122,18 @@ def test_a_former_name_is_taken_for_one_version(former, name, kind):
         assert type(find_estimator(former)) is kind
 
 
+def on_steps(num, dim):
+    """Return a design where each parameter is known by the step that it is on."""
+    prior = BoxUniform(torch.zeros(dim), torch.ones(dim))
+    noise = GaussianNoise(0.05)
+    stairs = SimulatorModel(lambda theta, action: (num * theta).floor(), noise=noise)
+    designer = InformationGainDesigner(DiscreteActions([0.0, 1.0]), num_samples=750)
+    return designer.select(None, stairs, belief=prior, seed=0)
+
+
 def test_outcomes_on_a_hundred_steps_are_left_to_nested_monte_carlo() -> None:
     """Nearest neighbors were .8 nat too high: what is between steps counted."""
-    prior = BoxUniform(torch.zeros(1), torch.ones(1))
-    stairs = SimulatorModel(
-        lambda theta, action: (100 * theta).floor(), noise=GaussianNoise(0.05)
-    )
-    designer = InformationGainDesigner(DiscreteActions([0.0, 1.0]), num_samples=750)
-    design = designer.select(None, stairs, belief=prior, seed=0)
+    design = on_steps(100, 1)
     assert design.estimator == "NestedGain"
     assert "on steps" in design.notes[0]
     gain = design.expected_information_gain
@@ -140,15 +142,6 @@ def test_outcomes_on_a_hundred_steps_are_left_to_nested_monte_carlo() -> None:
 
 def test_flat_steps_have_no_slopes_that_correct_a_gain() -> None:
     """Of sixteen steps it was .5 nat too low; of nine hundred it says that it errs."""
-    prior = BoxUniform(torch.zeros(2), torch.ones(2))
-    designer = InformationGainDesigner(DiscreteActions([0.0, 1.0]), num_samples=750)
-
-    def design(num):
-        stairs = SimulatorModel(
-            lambda theta, action: (num * theta).floor(), noise=GaussianNoise(0.05)
-        )
-        return designer.select(None, stairs, belief=prior, seed=0)
-
-    gain = design(4).expected_information_gain
+    gain = on_steps(4, 2).expected_information_gain
     assert float((gain - math.log(16)).abs().max()) < 0.1
-    assert "on steps" in design(30).notes[0]
+    assert "on steps" in on_steps(30, 2).notes[0]

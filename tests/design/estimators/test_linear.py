@@ -17,6 +17,9 @@ BELIEF = MultivariateNormal(
 )
 
 
+INVERSE = torch.eye(NUM).double() / 0.01  # of the covariance of white noise
+
+
 def jacobian(a):
     return torch.stack([a * torch.sin(a * TIMES), a * TIMES, a * torch.ones(NUM)], 1)
 
@@ -26,9 +29,9 @@ def simulations(mean, noise, theta, action):
     return CandidateSimulations(theta, action, x, mean, noise)
 
 
-def linear_case(noise, n=200):
+def linear_case(noise):
     torch.manual_seed(0)
-    theta, action = BELIEF.sample((n,)), torch.tensor([[0.5], [3.0]])
+    theta, action = BELIEF.sample((200,)), torch.tensor([[0.5], [3.0]])
     mean = torch.stack([theta.double() @ jacobian(float(a)).T for a in action])
     return simulations(mean, noise, theta, action)
 
@@ -39,15 +42,13 @@ def exact(a, inverse):
     return 0.5 * float(torch.logdet(torch.eye(DIM).double() + information))
 
 
+LASTING = AutocorrelatedNoise(0.1, correlation_time=0.3).at(TIMES)
+LASTING_INVERSE = (0.01 * torch.exp(-(TIMES[:, None] - TIMES).abs() / 0.3)).inverse()
+
+
 @pytest.mark.parametrize(
     ("noise", "inverse"),
-    [
-        (GaussianNoise(0.1), torch.eye(NUM).double() / 0.01),
-        (
-            AutocorrelatedNoise(0.1, correlation_time=0.3).at(TIMES),
-            (0.01 * torch.exp(-(TIMES[:, None] - TIMES).abs() / 0.3)).inverse(),
-        ),
-    ],
+    [(GaussianNoise(0.1), INVERSE), (LASTING, LASTING_INVERSE)],
 )
 def test_it_is_exact_where_outcomes_are_linear(noise, inverse):
     gain = LinearGain()(None, linear_case(noise), BELIEF)
@@ -60,7 +61,6 @@ def test_it_is_exact_where_outcomes_are_linear(noise, inverse):
 def test_few_simulations_are_unbiased():
     """Without the jackknife 24 simulations of three parameters lose .25 nat."""
     noise, found = GaussianNoise(0.1), []
-    inverse = torch.eye(NUM).double() / 0.01
     for seed in range(15):
         torch.manual_seed(seed)
         theta = BELIEF.sample((24,))
@@ -69,7 +69,7 @@ def test_few_simulations_are_unbiased():
         found.append(float(LinearGain()(None, case, BELIEF).mean()))
     mean = sum(found) / len(found)
     sd = torch.tensor(found).std() / len(found) ** 0.5
-    assert abs(mean - exact(3.0, inverse)) < 3 * float(sd) + 0.05
+    assert abs(mean - exact(3.0, INVERSE)) < 3 * float(sd) + 0.05
 
 
 def test_what_is_bent_counts_as_noise():
@@ -87,9 +87,8 @@ def test_what_is_bent_counts_as_noise():
 
 def test_of_some_parameters_it_is_exact_with_the_others_as_nuisances():
     """I(theta_S; x) = (log |S| - log |S after|) / 2 by the covariances of theta_S."""
-    gain = LinearGain(lambda t: t[:, [0, 2]])(
-        None, linear_case(GaussianNoise(0.1)), BELIEF
-    )
+    case = linear_case(GaussianNoise(0.1))
+    gain = LinearGain(lambda t: t[:, [0, 2]])(None, case, BELIEF)
     prior = BELIEF.covariance_matrix.double()
     for k, a in enumerate((0.5, 3.0)):
         j = jacobian(a)

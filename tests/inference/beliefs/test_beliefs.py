@@ -90,7 +90,6 @@ def exact():
 @pytest.mark.parametrize(
     "simulator",
     [SimulatorModel(line, noise=GaussianNoise(SD)), drawn],
-    ids=["declared", "drawn"],
 )
 def test_values_get_their_probabilities(simulator):
     belief = refine(simulator, PRIOR, ACTION, X, seed=0)
@@ -109,9 +108,8 @@ def test_values_get_their_probabilities(simulator):
     slope = torch.linspace(-3, 3, 3_001)
     total = 0.0
     for gear, switch in belief.values.tolist():
-        rows = torch.stack(
-            [torch.full_like(slope, gear), slope, torch.full_like(slope, switch)], 1
-        )
+        rows = torch.tensor([gear, 0.0, switch]).repeat(len(slope), 1)
+        rows[:, 1] = slope
         total += float(belief.smooth_log_prob(rows).double().exp().sum() * 6 / 3_000)
     assert total == pytest.approx(1, abs=0.02)
     assert belief.log_prob(torch.tensor([0.5, 0.0, 1.0])) == -torch.inf
@@ -122,10 +120,8 @@ def test_noise_is_not_inflated_for_a_value_that_trials_rule_out():
         return theta[:, :1] * action + 3 * theta[:, 1:]
 
     switch = Bernoulli(torch.tensor([1e-3]))
-    prior = MultipleIndependent(
-        [BoxUniform(torch.tensor([-3.0]), torch.tensor([3.0])), switch],
-        validate_args=False,
-    )
+    parts = [BoxUniform(torch.tensor([-3.0]), torch.tensor([3.0])), switch]
+    prior = MultipleIndependent(parts, validate_args=False)
     action = torch.tensor([[1.0], [1.0], [-1.0], [-1.0]])
     x = 0.5 * action + 3 + torch.tensor([[0.1], [-0.1], [0.1], [-0.1]])
     model = SimulatorModel(offset, noise=GaussianNoise(SD))
@@ -137,14 +133,9 @@ def test_noise_is_not_inflated_for_a_value_that_trials_rule_out():
 
 def test_a_campaign_designs_and_comes_back(tmp_path):
     model = SimulatorModel(line, noise=GaussianNoise(SD))
-    campaign = Campaign(
-        model,
-        PRIOR,
-        [0.5, 1.0, 2.0],
-        seed=0,
-        directory=tmp_path / "campaign",
-        options={"num_samples": 100, "num_scored": 100},
-    )
+    sizes = {"num_samples": 100, "num_scored": 100}
+    given = {"directory": tmp_path / "campaign", "options": sizes}
+    campaign = Campaign(model, PRIOR, [0.5, 1.0, 2.0], **given)
     trial = campaign.ask()
     assert 0.5 <= float(trial.action) <= 2.0
     campaign.tell([1.2])
@@ -161,6 +152,7 @@ def test_a_campaign_designs_and_comes_back(tmp_path):
 
 
 TWO = torch.ones(2)
+SHIFTED_EXPONENTIAL = [ExpTransform(), AffineTransform(0.2, 1.0)]
 
 
 def independent(prior: Distribution) -> Independent:
@@ -196,33 +188,18 @@ def scaled(theta, action):
     return theta * action
 
 
-def campaign(prior: Distribution, method: str = "asbi", **options) -> Campaign:
-    return Campaign(
-        SimulatorModel(scaled, noise=GaussianNoise(0.2)),
-        prior,
-        BoxActions([0.5], [2.0]),
-        method=method,
-        seed=0,
-        options={
-            "num_simulations": 300,
-            "num_samples": 100,
-            "num_scored": 100,
-            **options,
-        },
-    )
-
-
-NETWORKS = {True: "each round", False: "on demand"}
+def campaign(prior: Distribution, network: str = "on demand") -> Campaign:
+    model = SimulatorModel(scaled, noise=GaussianNoise(0.2))
+    options = {"num_simulations": 300, "num_samples": 100, "num_scored": 100}
+    options |= {"network": network}
+    return Campaign(model, prior, BoxActions([0.5], [2.0]), options=options)
 
 
 @pytest.mark.parametrize(
     "prior",
     [
         independent(Cauchy(0 * TWO, TWO)),
-        TransformedDistribution(
-            independent(Normal(0 * TWO, TWO)),
-            [ExpTransform(), AffineTransform(0.2, 1.0)],
-        ),
+        TransformedDistribution(independent(Normal(0 * TWO, TWO)), SHIFTED_EXPONENTIAL),
         MixtureSameFamily(
             Categorical(TWO),
             independent(Uniform(torch.tensor([[0.0], [0.2]]).expand(2, 2), 1.0)),
@@ -233,8 +210,8 @@ NETWORKS = {True: "each round", False: "on demand"}
 )
 def test_heavy_tails_and_mixtures_give_the_right_posterior(prior):
     set_validate_args(prior, True)  # as after an import of pyro, which says so for all
-    is_mixed = isinstance(prior, MixtureSameFamily)
-    c, x = campaign(prior, network=NETWORKS[is_mixed]), torch.tensor([0.6, 0.5])
+    x, is_mixed = torch.tensor([0.6, 0.5]), isinstance(prior, MixtureSameFamily)
+    c = campaign(prior, "each round" if is_mixed else "on demand")
     if is_mixed:
         c.ask()  # the network is trained and asked as well
     c.tell(x, action=[1.0])

@@ -249,10 +249,9 @@ def test_rows_of_earlier_trials_are_not_simulated_again():
     x = observe(model, 0)
     first = refine(model, BOX, ACTION[:2], x[:2], settings=FEW, seed=0)
     assert isinstance(first, SimulatedBelief)
-    anew, second = (
-        refine(model, BOX, ACTION, x, past=past, settings=FEW, seed=1)
-        for past in (None, first.histories)
-    )
+    given = {"settings": FEW, "seed": 1}
+    anew = refine(model, BOX, ACTION, x, **given)
+    second = refine(model, BOX, ACTION, x, past=first.histories, **given)
     saved = anew.diagnostics.num_simulations - second.diagnostics.num_simulations
     assert saved > 2 * 192
     sd = anew.variance.sqrt()

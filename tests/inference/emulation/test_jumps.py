@@ -37,9 +37,8 @@ def belief_of(response, seed):
     simulator = SimulatorModel(fn, noise=GaussianNoise(0.1))
     prior = BoxUniform(-torch.ones(2), torch.ones(2))
     options = CampaignOptions(max_simulations=300, planned_trials=2)
-    campaign = Campaign(
-        simulator, prior, BoxActions([0.5], [1.5]), options=options, seed=seed
-    )
+    given = {"options": options, "seed": seed}
+    campaign = Campaign(simulator, prior, BoxActions([0.5], [1.5]), **given)
     truth = torch.tensor([[0.3, EDGE + 0.05]])
     for xi in (0.7, 1.3):
         action = torch.tensor([[xi]])
@@ -98,20 +97,16 @@ def noisy(draw):
     return lambda theta, xi: theta * xi + 0.3 * draw(theta)
 
 
-NOISES = {
-    "normal": (torch.randn_like, True),
-    "exponential": (
-        lambda t: torch.distributions.Exponential(1.0).sample(t.shape),
-        False,
-    ),
-    "two points": (lambda t: torch.randn_like(t).sign(), False),
-    "varying": (lambda t: torch.exp(1.5 * t) * torch.randn_like(t), False),
-}
-
-
-@pytest.mark.parametrize("name", NOISES)
-def test_few_simulations_tell_noise_that_is_not_normal(name):
-    draw, holds = NOISES[name]
+@pytest.mark.parametrize(
+    ("draw", "holds"),
+    [
+        (torch.randn_like, True),
+        (lambda t: -torch.rand_like(t).log(), False),  # exponential
+        (lambda t: torch.randn_like(t).sign(), False),
+        (lambda t: torch.exp(1.5 * t) * torch.randn_like(t), False),
+    ],
+)
+def test_few_simulations_tell_noise_that_is_not_normal(draw, holds):
     options = CampaignOptions(max_simulations=500, planned_trials=3)
     actions = DiscreteActions([1.0, 2.0])
     campaign = Campaign(noisy(draw), PRIOR, actions, seed=0, options=options)

@@ -183,10 +183,8 @@ def refined(dim: int, num: int, seed: int, num_histories: int):
         return theta @ weight.T + 0.5 * torch.randn(len(theta), num)
 
     prior = MultivariateNormal(torch.zeros(dim), torch.eye(dim))
-    settings = RefinementOptions(num_histories=num_histories, num_effective=75)
-    belief = refine(
-        simulator, prior, torch.zeros(1, 1), x, settings=settings, seed=seed
-    )
+    sizes = RefinementOptions(num_histories=num_histories, num_effective=75)
+    belief = refine(simulator, prior, torch.zeros(1, 1), x, settings=sizes, seed=seed)
     design = weight.double()
     precision = torch.eye(dim).double() + design.T @ design / 0.25
     mean = torch.linalg.solve(precision, design.T @ x[0].double() / 0.25)
@@ -235,9 +233,8 @@ def test_many_correlated_numbers_of_the_right_simulator_are_not_unlike_it(lost):
         torch.manual_seed(seed)
         x = simulator(prior.sample((1,)), torch.ones(1, 1))
         x[:, torch.randperm(150)[:lost]] = torch.nan
-        settings = RefinementOptions(num_histories=300, num_effective=25)
-        belief = refine(
-            simulator, prior, torch.ones(1, 1), x, settings=settings, seed=seed
-        )
+        sizes = RefinementOptions(num_histories=300, num_effective=25)
+        one = torch.ones(1, 1)
+        belief = refine(simulator, prior, one, x, settings=sizes, seed=seed)
         tails.append(belief.diagnostics.tail_probability)
     assert min(tails) > 0.01

@@ -136,9 +136,8 @@ def test_beyond_twelve_parameters_draws_follow_the_density():
     """Factors of a component are its own there, and one solve serves its draws."""
     torch.manual_seed(0)
     dim, condition = 13, torch.randn(300, 4)
-    net = MixtureDensity(hidden_features=(8,), num_components=2).build(
-        torch.randn(300, dim), condition, 1
-    )
+    settings = MixtureDensity(hidden_features=(8,), num_components=2)
+    net = settings.build(torch.randn(300, dim), condition, 1)
     *_, last = net.net.children()
     assert last.out_features == 2 * (1 + 2 * dim)
     own = dict(net.named_parameters())
@@ -206,17 +205,12 @@ def test_a_network_of_many_numbers_comes_near_the_exact_posterior():
     theta, condition = rows(4_000, 0)
     with forked_generators(1):
         network = MixtureDensity().build(theta, condition, 1)
-        train_network(
-            network,
-            Adam(network.parameters(), rate=1.5e-2),
-            network.prepared_loss,
-            network.prepare(theta, condition),
-            train_rows=torch.arange(3_600),
-            held_out_rows=torch.arange(3_600, 4_000),
-            num_iterations=160,
-            batch_size=200,
-            anneal=True,
-        )
+        steps = Adam(network.parameters(), rate=1.5e-2)
+        fitted, held_out = torch.arange(4_000).split([3_600, 400])
+        given = {"train_rows": fitted, "held_out_rows": held_out}
+        given |= {"num_iterations": 160, "batch_size": 200, "anneal": True}
+        data, loss = network.prepare(theta, condition), network.prepared_loss
+        train_network(network, steps, loss, data, **given)
     assert network.conditioning.baseline.kind == "linear"
     theta, condition = rows(2_000, 2)
     with torch.no_grad():

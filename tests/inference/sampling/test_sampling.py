@@ -123,12 +123,10 @@ WEIGHTS = np.array([0.25, 0.75])
 Z = np.random.default_rng(0).normal(size=(2_500, 2)) * 3
 
 
-def density(weights: np.ndarray, inflation: float = 1.0) -> np.ndarray:
+def density(weights: np.ndarray) -> np.ndarray:
     """Return SciPy's density at Z."""
-    triples = zip(weights, MEANS, FACTORS, strict=True)
-    return sum(
-        w * multivariate_t(m, inflation * f @ f.T, df=5).pdf(Z) for w, m, f in triples
-    )
+    parts = zip(weights, MEANS, FACTORS, strict=True)
+    return sum(w * multivariate_t(m, f @ f.T, df=5).pdf(Z) for w, m, f in parts)
 
 
 def test_the_density_is_scipy_s():
@@ -160,9 +158,8 @@ def test_a_singular_covariance_has_its_smallest_variances_raised():
     factor = lower_factors(covariance)
     assert (np.triu(factor, 1) == 0).all()
     assert (np.diagonal(factor, axis1=1, axis2=2) > 0).all()
-    assert (factor @ np.swapaxes(factor, 1, 2))[0] == pytest.approx(
-        covariance[0], abs=1e-9
-    )
+    product = factor @ np.swapaxes(factor, 1, 2)
+    assert product[0] == pytest.approx(covariance[0], abs=1e-9)
 
 
 # Evidences and moments of densities whose integral is known
@@ -183,31 +180,20 @@ def test_two_modes_keep_their_masses():
         parts = [multivariate_normal.logpdf(u, [m, 0], 0.04) for m in (-2, 1)]
         return np.logaddexp(*parts)
 
-    found = bridge(
-        standard,
-        likelihood,
-        mixture([-2, 0], [1, 0], sd=0.3),
-        np.random.default_rng(0),
-        num_particles=4_000,
-    )
-    masses = [
-        multivariate_normal.pdf([m, 0], [0, 0], 1.04 * np.eye(2)) for m in (-2, 1)
-    ]
+    base, rng = mixture([-2, 0], [1, 0], sd=0.3), np.random.default_rng(0)
+    found = bridge(standard, likelihood, base, rng, num_particles=4_000)
+    masses = multivariate_normal.pdf([[-2, 0], [1, 0]], [0, 0], 1.04 * np.eye(2))
     assert abs(found.log_evidence - np.log(sum(masses))) < 4 * found.standard_error
     share = (found.u[:, 0] < -0.5).mean()
     assert share == pytest.approx(masses[0] / sum(masses), abs=0.05)
 
 
 def test_too_few_evaluations_are_no_answer():
-    found = bridge(
-        standard,
-        lambda u: norm.logpdf(1.0, u, 0.01).sum(1),
-        mixture([-3.0], sd=0.1),
-        np.random.default_rng(0),
-        num_particles=500,
-        most=600,
-    )
-    assert found is None
+    def likelihood(u):
+        return norm.logpdf(1.0, u, 0.01).sum(1)
+
+    base, rng = mixture([-3.0], sd=0.1), np.random.default_rng(0)
+    assert bridge(standard, likelihood, base, rng, num_particles=500, most=600) is None
 
 
 # Normal variables between bounds, in the tails too, against SciPy

@@ -68,9 +68,8 @@ def test_the_product_is_sbi_s_condition_on_theta():
     theta = PRIOR.sample((20,))
     with torch.no_grad():
         expected = theirs(theta, x_o=X).double()
-        assert ours.log_factors(theta).tolist() == pytest.approx(
-            expected.tolist(), rel=1e-4, abs=1e-3
-        )
+        found = ours.log_factors(theta).tolist()
+        assert found == pytest.approx(expected.tolist(), rel=1e-4, abs=1e-3)
         table = model.log_likelihood_table(X, theta, ACTION[0])
         row = model.log_likelihood(X[:1].expand(20, -1), theta, ACTION[:1])
     assert table[0].tolist() == pytest.approx(row.tolist(), abs=1e-4)

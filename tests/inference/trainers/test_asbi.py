@@ -56,9 +56,8 @@ def test_two_rounds_chain_to_the_exact_posterior():
     for trial in TRIALS[:2]:
         theta = belief.sample((3_000,))
         xi = 3 * torch.rand(len(theta), 1)
-        inference.append_simulations(
-            theta, simulator(theta, xi), action=xi, belief=belief
-        ).train()
+        rows = theta, simulator(theta, xi)
+        inference.append_simulations(*rows, action=xi, belief=belief).train()
         belief = inference.update(trial.x, action=trial.action)
     assert belief.label == "chained approximation"
     truth = exact(inference.trials)
@@ -107,9 +106,8 @@ def test_the_posterior_takes_outcomes_without_a_measurement():
     assert (batched.mean(0)[:, 1] > 0.8).tolist() == [True, False, False]
     at = [{"x": row, "action": torch.ones(1)} for row in both]
     single = torch.stack([posterior.log_prob(draws[:5], **one) for one in at], 1)
-    batch = posterior.log_prob_batched(
-        draws[:5, None].expand(5, 3, 2), both, torch.ones(3, 1)
-    )
+    three = draws[:5, None].expand(5, 3, 2)
+    batch = posterior.log_prob_batched(three, both, torch.ones(3, 1))
     assert torch.allclose(batch, single, atol=1e-4)
     assert posterior.sample((), **at[1]).shape == (2,)
     best = posterior.map(num_iter=5, num_to_optimize=5, **at[2])
@@ -235,10 +233,8 @@ def test_errors_of_a_chained_belief_do_not_stay():
     theta, action = wrong.sample((500,)), 3 * torch.rand(500, 1)
     x = simulator(theta, action)
     inference.append_simulations(theta, x, action=action, belief=wrong).train()
-    trial = TRIALS[0]
-    belief = inference.update(
-        trial.x, action=trial.action, simulator=simulator, refinement=REFINEMENT, seed=0
-    )
+    told = {"simulator": simulator, "refinement": REFINEMENT, "seed": 0}
+    belief = inference.update(TRIALS[0].x, action=TRIALS[0].action, **told)
     assert divergence(belief, exact(TRIALS[:1])) < COST
     assert belief.diagnostics.chained_loss > 5
 

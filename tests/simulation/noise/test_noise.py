@@ -93,9 +93,8 @@ def test_a_row_depends_on_its_seed_alone(noise):
 
 def test_sizes_that_are_unknown_by_channel_are_summed_channel_by_channel():
     bounds = [(0.1, 1.0), (20.0, 400.0)]
-    noise = AutocorrelatedNoise.unknown(
-        sd=bounds, correlation_time=(0.05, 2.0), num_sds=7, num_times=3
-    )
+    sizes = {"correlation_time": (0.05, 2.0), "num_sds": 7, "num_times": 3}
+    noise = AutocorrelatedNoise.unknown(sd=bounds, **sizes)
     assert noise.parameter_names == ("sd_1", "sd_2", "correlation_time")
     gen = torch.Generator().manual_seed(0)
     x = torch.randn(2, 5, 2, generator=gen).double() * torch.tensor([0.4, 90.0])
@@ -111,13 +110,10 @@ def test_sizes_that_are_unknown_by_channel_are_summed_channel_by_channel():
             for c in range(2):
                 y = row[:, c].numpy()
                 seen = ~np.isnan(y)
-                laws = [
-                    stats.multivariate_normal(
-                        np.zeros(seen.sum()), covariance(TIMES[seen], tau, sd)
-                    )
-                    for sd in nodes[c]
-                ]
-                each.append(np.logaddexp.reduce([law.logpdf(y[seen]) for law in laws]))
+                zero, law = np.zeros(seen.sum()), stats.multivariate_normal
+                covs = [covariance(TIMES[seen], tau, sd) for sd in nodes[c]]
+                log_p = [law(zero, cov).logpdf(y[seen]) for cov in covs]
+                each.append(np.logaddexp.reduce(log_p))
             terms.append(sum(each) - 2 * np.log(7) - np.log(3))
         expected = np.logaddexp.reduce(terms)
         got = noise.at(TIMES).log_prob(row[None], torch.zeros(5, 2))
@@ -181,9 +177,7 @@ def test_marginal_of_gaussian_noise_is_a_student_t():
     sd = pooled.sd.item()
     for row, value in zip(e, joint, strict=True):
         seen = row[~row.isnan()].numpy()
-        law = stats.multivariate_t(
-            np.zeros(len(seen)), sd**2 * np.eye(len(seen)), df=16
-        )
+        law = stats.multivariate_t(np.zeros(len(seen)), sd**2 * np.eye(len(seen)), 16)
         assert value.item() == pytest.approx(law.logpdf(seen))
 
 
