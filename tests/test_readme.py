@@ -111,9 +111,8 @@ def test_closing_the_loop(run, capsys):
     _, bare, _, forces, drag, decides, starts, campaign, *motor = pages
     printed = capsys.readouterr().out
     assert bare.report.verdict == "unexplained"
-    (begins,) = re.findall(
-        r"```text\n(Verdict.*?)```", (ROOT / "docs/overview.md").read_text(), re.DOTALL
-    )
+    overview = (ROOT / "docs/overview.md").read_text()
+    (begins,) = re.findall(r"```text\n(Verdict.*?)```", overview, re.DOTALL)
     assert printed.startswith(f"unexplained\n{begins}")
     assert "P holds among the declared effects alone" in " ".join(printed.split())
     table = drag.report.before_after.set_index("metric")

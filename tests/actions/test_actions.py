@@ -52,16 +52,11 @@ def test_mixed_contains_and_lists():
     assert lists.contains(lists.listed()).all()
 
 
-@pytest.mark.parametrize(
-    ("make", "text"),
-    [
-        (lambda: DiscreteActions([]), "expected actions of shape"),
-        (lambda: BoxActions(1.0, 1.0), "expected finite low < high"),
-    ],
-)
-def test_bad_spaces(make, text):
-    with pytest.raises(ValueError, match=text):
-        make()
+def test_bad_spaces():
+    with pytest.raises(ValueError, match="expected actions of shape"):
+        DiscreteActions([])
+    with pytest.raises(ValueError, match="expected finite low < high"):
+        BoxActions(1.0, 1.0)
     with pytest.raises(TypeError, match="expected action spaces; got list"):
         MixedActions([0.0, 1.0])
 
@@ -145,13 +140,9 @@ def test_recorded_signals_are_listed():
 
 
 def test_signals_of_several_inputs_are_one_action():
-    space = SignalActions(
-        together(chirp("hip", amplitude=0.2), multisine([1.0, 2.0], "knee")),
-        [0.1, 1.0, 0.0, 0.0],
-        [1.0, 5.0, 0.3, 0.3],
-        input_times=TIMES,
-        amplitude={"knee": 0.4},
-    )
+    both = together(chirp("hip", amplitude=0.2), multisine([1.0, 2.0], "knee"))
+    low, high = [0.1, 1.0, 0.0, 0.0], [1.0, 5.0, 0.3, 0.3]
+    space = SignalActions(both, low, high, input_times=TIMES, amplitude={"knee": 0.4})
     assert space.names[1:3] == ["hip end frequency", "knee amplitude at 1 Hz"]
     action = torch.tensor([[0.5, 3.0, 0.1, 0.2]])
     played = space.inputs(action)

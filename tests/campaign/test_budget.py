@@ -10,7 +10,6 @@ from torch.distributions import MultivariateNormal
 from sbi_active import (
     BoxActions,
     Campaign,
-    CampaignOptions,
     DiscreteActions,
     GaussianNoise,
     SimulatorModel,
@@ -18,7 +17,7 @@ from sbi_active import (
 )
 from sbi_active.campaign.options import CampaignDetails
 from sbi_active.cli.record import Record, answer_of, sum_up_campaign
-from tests.campaign.problem import ACTIONS, MODEL, OPTIONS, REFINEMENT, campaign
+from tests.campaign.problem import ACTIONS, MODEL, OPTIONS, campaign
 
 
 def pay(action):
@@ -171,13 +170,9 @@ def information(history):
 def test_pairs_tell_more_than_single_trials_for_the_same_budget():
     told = {}
     for look_ahead in (1, 2):
-        options = CampaignOptions(
-            num_samples=64,
-            network="on demand",
-            refinement=REFINEMENT,
-            details=CampaignDetails(num_scored=100, look_ahead=look_ahead),
-            stop=StopRules(budget=16.0),
-        )
+        details = CampaignDetails(num_scored=100, look_ahead=look_ahead)
+        sizes = {"num_samples": 64, "details": details}
+        options = evolve(OPTIONS, stop=StopRules(budget=16.0), **sizes)
         model = SimulatorModel(measure, noise=GaussianNoise(1.0))
         c = Campaign(model, prior_of(5), MEASURED, cost=trip, options=options)
         c.run(lambda action: measure(TRUTH, action[None])[0], num_rounds=20)

@@ -240,9 +240,8 @@ def force(theta, action):
     return action * theta[:, :1] * theta[:, 1:]
 
 
-FORCE = SimulatorModel(
-    force, noise=GaussianNoise(0.01), parameter_names=["friction", "mass"]
-)
+NAMES = ["friction", "mass"]
+FORCE = SimulatorModel(force, noise=GaussianNoise(0.01), parameter_names=NAMES)
 
 
 def test_what_is_said_outlives_the_process(tmp_path):

@@ -33,9 +33,8 @@ finally:
     ],
 )
 def test_nothing_heavy_is_imported(arguments, status, text):
-    done = subprocess.run(
-        [sys.executable, "-c", COMMAND, *arguments], capture_output=True, text=True
-    )
+    words = [sys.executable, "-c", COMMAND, *arguments]
+    done = subprocess.run(words, capture_output=True, text=True)
     assert done.returncode == status
     assert text in " ".join((done.stdout + done.stderr).split())
     assert done.stdout.endswith("imported: []\n")

@@ -79,10 +79,9 @@ class Fragile:
             log_v = self.log_valid(GRID, a)
             p = log_v.exp()
             valid = (WEIGHT * p).sum()
-            validity = WEIGHT @ (
-                torch.special.xlogy(p, p / valid)
-                + torch.special.xlogy(1 - p, (1 - p) / (1 - valid))
-            )
+            known = torch.special.xlogy(p, p / valid)
+            known += torch.special.xlogy(1 - p, (1 - p) / (1 - valid))
+            validity = WEIGHT @ known
             log_x = -0.5 * (x[:, None] - a * GRID) ** 2 - 0.5 * math.log(2 * math.pi)
             # E over measurements of log p(x | theta) - log p(x | valid)
             joint = WEIGHT * p / valid

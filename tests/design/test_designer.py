@@ -12,9 +12,8 @@ ACTIONS = DiscreteActions(VALUES, names=["push"], units=["m/s"])
 
 
 def test_it_finds_the_action_that_tells_most():
-    designer = InformationGainDesigner(
-        ACTIONS, num_samples=4_000, estimator="posterior"
-    )
+    sizes = {"num_samples": 4_000, "estimator": "posterior"}
+    designer = InformationGainDesigner(ACTIONS, **sizes)
     design = designer.select(ExactModel(), simulator, seed=0)
     assert design.action.tolist() == [2.0]
     assert design.index == 3
@@ -26,10 +25,8 @@ def test_it_finds_the_action_that_tells_most():
     assert design.stopped == "leader separated"
     assert design.notes == ()
     assert design.labels == ("push [m/s]",)
-    z = (design.expected_information_gain - information(VALUES[:, None])) / (
-        design.standard_error
-    )
-    assert (z[1:].abs() < 4).all()
+    off = design.expected_information_gain - information(VALUES[:, None])
+    assert ((off / design.standard_error)[1:].abs() < 4).all()
     assert design.probability_best.sum() == pytest.approx(1.0)
     assert design.probability_best[3] > 0.99
     assert (design.probability_valid == 1).all()
@@ -100,10 +97,8 @@ def test_a_mean_that_changes_from_run_to_run_is_a_draw():
 
 
 def test_leading_actions_get_more_simulations():
-    values = torch.tensor([0.0, 0.01, 3.0, 3.3, 3.6])
-    designer = InformationGainDesigner(
-        DiscreteActions(values), num_samples=100, estimator="posterior"
-    )
+    actions = DiscreteActions([0.0, 0.01, 3.0, 3.3, 3.6])
+    designer = InformationGainDesigner(actions, num_samples=100, estimator="posterior")
     designs = [designer.select(ExactModel(), simulator, seed=s) for s in range(10)]
     most = torch.tensor([int(design.num_samples[design.index]) for design in designs])
     assert 48 in most  # separated at once; a multiple of four

@@ -114,6 +114,5 @@ def test_a_linear_model_tells_what_it_tells_in_closed_form():
         gain = float(design.expected_information_gain[k])
         assert abs(gain - exact(action, 2.0)) < 4 * float(error[k]) + 0.03
     assert float(design.action) == 3.0
-    assert any(
-        "32 linear summaries stand for the 300 numbers" in n for n in design.notes
-    )
+    text = "32 linear summaries stand for the 300 numbers"
+    assert any(text in note for note in design.notes)

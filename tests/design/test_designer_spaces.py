@@ -26,10 +26,8 @@ def test_regret_on_the_numerical_task():
     action = torch.full((1, 1), -5.0)
     x = task.simulator.mean(task.theta_true[None], action)
     posterior = task.reference(action, x)
-    belief = Exact(posterior)
-    design = InformationGainDesigner(BOX).select(
-        None, task.simulator, belief=belief, seed=0
-    )
+    given = {"belief": Exact(posterior), "seed": 0}
+    design = InformationGainDesigner(BOX).select(None, task.simulator, **given)
     exact = posterior.expected_information_gain(torch.linspace(-5, 5, 101))
     own = posterior.expected_information_gain(design.candidates)
     assert float(exact.max() - own[design.index]) <= 0.05

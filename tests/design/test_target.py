@@ -23,9 +23,8 @@ def one_at_a_time(theta, action):
     return both.gather(1, (action > 0.5).long())
 
 
-MODEL = SimulatorModel(
-    one_at_a_time, noise=GaussianNoise(1.0), parameter_names=["mass", "friction"]
-)
+NAMES = ["mass", "friction"]
+MODEL = SimulatorModel(one_at_a_time, noise=GaussianNoise(1.0), parameter_names=NAMES)
 
 
 def select(target, *, model=MODEL, belief=PRIOR, **options):

@@ -133,11 +133,6 @@ def test_pieces_are_escaped():
 # Pages that travel: what is on them, and what a browser makes of them
 
 
-NUMBERS = Table(
-    ("name", "value"), [("b", "10"), ("a", "-2.5"), ("d", ""), ("c", "1e3")]
-)
-
-
 def test_all_text_is_escaped():
     table = Table(("<p>",), [("&",)])
     sections = [Section("<b>", text=["<i>"], items=["<u>"], table=table)]
@@ -151,7 +146,9 @@ def test_all_text_is_escaped():
 
 
 def test_tables_are_sorted_by_a_click_numbers_as_numbers(tmp_path):
-    made = Page("Sorted", [Section("numbers", table=NUMBERS)]).html()
+    rows = [("b", "10"), ("a", "-2.5"), ("d", ""), ("c", "1e3")]
+    numbers = Table(("name", "value"), rows)
+    made = Page("Sorted", [Section("numbers", table=numbers)]).html()
     frames, console = look(made, tmp_path)
     assert console == []
     ((up, down, state),) = frames["390"]["sorted"]

@@ -10,10 +10,8 @@ import pytest
 from tests.docs import ROOT, extension
 
 #: Names that need an extra, and the attribute of a module that it brings.
-OPTIONAL = {
-    "from_sysid": ("mujoco.sysid", "ModelSequences"),
-    "belief_to_parameters": ("mujoco.sysid", "ModelSequences"),
-}
+SYSID = ("mujoco.sysid", "ModelSequences")
+OPTIONAL = {"from_sysid": SYSID, "belief_to_parameters": SYSID}
 FLAGS = doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE
 pytest.importorskip("sphinx")
 
@@ -49,14 +47,11 @@ def _is_there(module: str, attribute: str) -> bool:
 @pytest.mark.parametrize("package", reference.PACKAGES)
 def test_every_name_has_one(package):
     _, blocks = reference.examples(package)
-    without = [
-        name
-        for module, names in reference.groups(package)
-        for name in names
-        if ">>>"
-        not in (inspect.getdoc(getattr(importlib.import_module(module), name)) or "")
-        or name == "TASKS"
-    ]
+    without = []
+    for module, names in reference.groups(package):
+        for name in names:
+            text = inspect.getdoc(getattr(importlib.import_module(module), name))
+            without += [name] if ">>>" not in (text or "") or name == "TASKS" else []
     assert sorted(blocks) == sorted(without)
     assert all(">>> " in block for block in blocks.values())
 

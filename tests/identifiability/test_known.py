@@ -99,10 +99,9 @@ def linear_posterior(num, num_trials, seed, sd=0.05):
     return belief, prior, covariance
 
 
+SPEEDS = torch.tensor([0.5, 1.0, 4.0])
 NONLINEAR = {
-    "drag": lambda a, b: torch.cat(
-        [torch.log1p(b * v**2 / a) / (2 * b) for v in (0.5, 1.0, 4.0)], 1
-    ),
+    "drag": lambda a, b: torch.log1p(b * SPEEDS**2 / a) / (2 * b),
     "decay": lambda a, b: torch.cat([a * torch.exp(-b * t) for t in (0.1, 3.0)], 1),
     "two modes": lambda a, b: torch.cat([(a - 0.6) ** 2, b], 1),
 }

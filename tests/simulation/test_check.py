@@ -6,7 +6,7 @@ import pytest
 import torch
 from sbi.utils import BoxUniform
 
-from sbi_active import DiscreteActions, GaussianNoise, SimulatorModel
+from sbi_active import DiscreteActions, SimulatorModel
 from sbi_active.cli import main
 from sbi_active.simulation import check_simulator
 
@@ -84,14 +84,8 @@ def test_defects_are_found(simulator, expected):
     ("simulator", "expected"),
     [
         (lambda t, a: noisy(t, a)[:, :1], "changing theta_2 leaves x as it is"),
-        (
-            SimulatorModel(noisy, noise=GaussianNoise(1.0)),
-            "fn is random beside declared noise, which so counts twice",
-        ),
-        (
-            SimulatorModel(some_raise, batched=False),
-            "FloatingPointError: unstable contact; their outcome is missing",
-        ),
+        (SimulatorModel(noisy, noise=1.0), "fn is random beside declared noise, which"),
+        (SimulatorModel(some_raise, batched=False), "unstable contact; their outcome"),
     ],
 )
 def test_warnings_do_not_fail(simulator, expected):

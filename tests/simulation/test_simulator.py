@@ -51,11 +51,7 @@ def model_of(function):
     return SimulatorModel(lambda theta, action: function(theta))
 
 
-BEYOND = [
-    lambda t: t.double() + 1e39,
-    lambda t: t.double().numpy() - 1e200,
-    lambda t: [1e39] * len(t),
-]
+BEYOND = [lambda t: t.double().numpy() - 1e200, lambda t: [1e39] * len(t)]
 COMPLEX = [lambda t: t + 1j, lambda t: t.numpy() + 1j, lambda t: [1j] * len(t)]
 EMPTY = [lambda t: torch.zeros(len(t), 3, 0), lambda t: [[]] * len(t)]
 

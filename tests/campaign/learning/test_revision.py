@@ -19,11 +19,7 @@ from tests.effects import BIAS, on_outcomes
 
 PRIOR = BoxUniform(-2 * torch.ones(1), 2 * torch.ones(1))
 ACTIONS = DiscreteActions([-2.0, -1.0, 1.0, 2.0])
-MODEL = SimulatorModel(
-    lambda theta, action: theta * action,
-    noise=GaussianNoise(0.1),
-    parameter_names=["slope"],
-)
+MODEL = SimulatorModel(lambda theta, action: theta * action, noise=GaussianNoise(0.1))
 OPTIONS = evolve(problem.OPTIONS, details=CampaignDetails(num_scored=400))
 SHIFT = 0.8
 

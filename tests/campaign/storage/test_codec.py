@@ -58,10 +58,9 @@ class Foreign:
 def test_only_classes_of_trusted_packages():
     with pytest.raises(NotStorableError, match="Foreign"):
         encode(Foreign(), known={})
-    design = back(
-        Design(*[torch.zeros(1)] * 7, bound="none", index=0, num_simulations=3)
-    )
-    assert design.num_simulations == 3
+    parts = [torch.zeros(1)] * 7
+    design = Design(*parts, bound="none", index=0, num_simulations=3)
+    assert back(design).num_simulations == 3
     for name in (
         "os:system",
         "subprocess:Popen",
@@ -71,9 +70,8 @@ def test_only_classes_of_trusted_packages():
     ):
         with pytest.raises(ValueError, match="not a type object"):
             decode(written(Called(codec.made, name, {})), known={})
-    assert not {"sbi_active.__main__", "torch.utils.bottleneck.__main__"} & {
-        *sys.modules
-    }
+    run = {"sbi_active.__main__", "torch.utils.bottleneck.__main__"}
+    assert not run & {*sys.modules}
 
 
 class Called:

@@ -2,6 +2,7 @@
 
 import os
 import threading
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
@@ -25,14 +26,8 @@ def number(k):
 
 def test_eight_threads_lose_nothing(tmp_path):
     c = new(tmp_path / "c")
-    threads = [
-        threading.Thread(target=lambda k=k: c.attach([1.0], number(k)))
-        for k in range(40)
-    ]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
+    with ThreadPoolExecutor(8) as threads:
+        [*threads.map(lambda k: c.attach([1.0], number(k)), range(40))]
     c.close()
     assert sorted(told(tmp_path / "c")) == [number(k) for k in range(40)]
 

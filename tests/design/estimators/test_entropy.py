@@ -53,13 +53,9 @@ def test_scales_and_correlation_do_not_matter():
     rows = declared()
     assert rows.mean is not None
     turn = torch.tensor([[1e4, 0.0], [9e3, 1e-2]])
-    turned = CandidateSimulations(
-        rows.theta,
-        rows.action,
-        rows.x @ turn,
-        rows.mean @ turn,
-        replicate=(rows.mean + torch.randn_like(rows.x)) @ turn,
-    )
+    again = rows.mean + torch.randn_like(rows.x)
+    parts = {"x": rows.x @ turn, "mean": rows.mean @ turn, "replicate": again @ turn}
+    turned = CandidateSimulations(rows.theta, rows.action, **parts)
     assert (distance(turned, information(ACTIONS)) < BIAS).all()
 
 

@@ -151,7 +151,6 @@ def test_outcomes_without_a_density_are_not_left_out_of_the_mean():
 def test_draws_that_are_all_alike_have_their_outcome():
     # As those of a belief that has collapsed to a draw.
     theta = torch.full((60, 3), 0.37).double()
-    emulator = MeanEmulator.fit(theta, torch.full((60, 4), 2.0).double())
-    torch.testing.assert_close(
-        emulator(emulator.knots), torch.full((60, 4), 2.0).double()
-    )
+    mean = torch.full((60, 4), 2.0).double()
+    emulator = MeanEmulator.fit(theta, mean)
+    torch.testing.assert_close(emulator(emulator.knots), mean)

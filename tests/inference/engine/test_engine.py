@@ -33,15 +33,10 @@ class Given(SimulatedPotential):
     """
 
     def __init__(self, function, dim, observed, *, sd=1.0):
-        bound = np.full(dim, 8.0)
-        self.coordinates = SimpleNamespace(
-            dim=dim,
-            precision=np.ones(dim),
-            center=np.zeros(dim),
-            low=-bound,
-            high=bound,
-            sample=lambda n, rng: rng.standard_normal((n, dim)),
-        )
+        own = SimpleNamespace(dim=dim, precision=np.ones(dim), center=np.zeros(dim))
+        own.low, own.high = np.full((2, dim), [[-8.0], [8.0]])
+        own.sample = lambda n, rng: rng.standard_normal((n, dim))
+        self.coordinates = own
         self.dim, self.searched = dim, np.ones(dim, dtype=bool)
         self.function, self.num_observed, self.step = function, observed, 3e-3
         self.sd, self.num_trials, self.known = sd, 1, set()

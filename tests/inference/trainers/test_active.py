@@ -44,7 +44,7 @@ def round_of(inference):
 @pytest.mark.filterwarnings("ignore:.*Maximum number of epochs")
 @pytest.mark.parametrize(
     ("trainer", "estimator"),
-    [*[(ASBI, "maf"), (ALHI, None)], (SeqBED, None), (SeqBED, "mlp")],
+    [(ASBI, "maf"), (ALHI, None), (SeqBED, None), (SeqBED, "mlp")],
 )
 def test_a_pickled_trainer_goes_on(trainer, estimator):
     whole = round_of(trainer(PRIOR, estimator, show_progress_bars=False))
@@ -146,9 +146,8 @@ def test_methods_take_what_sbi_takes_in_the_same_order(trainer):
         extra = [p for n, p in ours.items() if n not in theirs]
         assert all(p.kind is inspect.Parameter.KEYWORD_ONLY for p in extra)
         if name == "build_posterior":
-            assert [p.default for p in given.values()] == [
-                ours[n].default for n in theirs
-            ]
+            defaults = [ours[n].default for n in theirs]
+            assert [p.default for p in given.values()] == defaults
 
 
 def test_none_is_sbi_s_to_refuse_where_it_is_not_its_default():

@@ -126,10 +126,8 @@ def test_images_pass_through_an_embedding():
     image = image + 0.1 * torch.randn(400, 1, 6, 6)
     cnn = torch.nn.Sequential(torch.nn.Conv2d(1, 2, 3), torch.nn.Flatten())
     embedding = ActionEmbedding(cnn, (1, 6, 6), 2)
-    for estimator in (
-        posterior_nn("mdn", embedding_net=embedding),
-        MixtureDensity(embedding_net=embedding, num_iterations=50),
-    ):
+    ours = MixtureDensity(embedding_net=embedding, num_iterations=50)
+    for estimator in (posterior_nn("mdn", embedding_net=embedding), ours):
         inference = ASBI(BOX, estimator, show_progress_bars=False)
         inference.append_simulations(theta, image, action=action)
         inference.train(max_num_epochs=2)
@@ -242,12 +240,10 @@ def test_errors_of_a_chained_belief_do_not_stay():
 def test_update_all_starts_from_scratch_and_order_does_not_matter():
     inference = ASBI(PRIOR)
     inference.update(torch.ones(2), action=torch.ones(1), simulator=simulator, seed=0)
-    beliefs = [
-        inference.update_all(trials, simulator, refinement=REFINEMENT, seed=1)
-        for trials in (TRIALS, TRIALS[::-1])
-    ]
-    assert inference.trials == TRIALS[::-1]
-    for belief in beliefs:
+    for trials in (TRIALS, TRIALS[::-1]):
+        given = {"refinement": REFINEMENT, "seed": 1}
+        belief = inference.update_all(trials, simulator, **given)
+        assert inference.trials == trials
         assert divergence(belief, exact(TRIALS)) < COST
 
 

@@ -33,10 +33,8 @@ def bank(tmp_path):
 
 
 def same(a, b):
-    return all(
-        torch.equal(x.nan_to_num(nan=-99.0), y.nan_to_num(nan=-99.0))
-        for x, y in [(a.theta, b.theta), (a.action, b.action), (a.x, b.x)]
-    ) and torch.equal(a.status, b.status)
+    rows = [[s.theta, s.action, s.x.nan_to_num(nan=-99.0), s.status] for s in (a, b)]
+    return all(torch.equal(*pair) for pair in zip(*rows, strict=True))
 
 
 @pytest.mark.parametrize("num", [300, 1])

@@ -224,11 +224,8 @@ def swap(folder):
 
 def duplicate_in_place_of_another(folder):
     remove(folder, 3)
-    execute(
-        folder,
-        "INSERT INTO records SELECT kind, 3, digest, content FROM records WHERE "
-        "kind = 'rows' AND number = 2",
-    )
+    copied = "SELECT kind, 3, digest, content FROM records WHERE number = 2"
+    execute(folder, f"INSERT INTO records {copied} AND kind = 'rows'")
 
 
 def close_the_gap_by_hand(folder):

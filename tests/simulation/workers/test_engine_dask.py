@@ -140,10 +140,9 @@ def test_workers_that_the_cluster_gave_up_are_asked_for_again(rows, monkeypatch)
         for name in [*cluster.workers]:
             await cluster.workers.pop(name).close()
 
+    own = {"n_workers": 1, "processes": False, "dashboard_address": None}
     with (
-        distributed.LocalCluster(
-            n_workers=1, processes=False, dashboard_address=None
-        ) as cluster,
+        distributed.LocalCluster(**own) as cluster,
         distributed.Client(cluster) as client,
         warnings.catch_warnings(record=True) as said,
     ):

@@ -200,13 +200,13 @@ class Stop(BaseException):
 
 
 def raising():
-    raise Stop("the reason")
+    raise Stop("no licence")
 
 
 @pytest.mark.parametrize(
     ("end", "text"),
     [
-        (raising, r"(?s)in simulator.*the reason\s*$"),
+        (raising, r"(?s)in simulator.*no licence\s*$"),
         (lambda: os._exit(3), "ended with code 3 during the call"),
     ],
 )
@@ -223,14 +223,10 @@ def test_whatever_ends_a_call_in_a_worker_is_told(end, text):
     assert torch.equal(rows.x[rows.valid], expected[rows.valid])
 
 
-def ending():
-    raise Stop("no licence")
-
-
 @pytest.mark.parametrize(
     ("setup", "text"),
     [
-        (ending, r"(?s)can load; got.*no licence"),
+        (raising, r"(?s)can load; got.*no licence"),
         (lambda: time.sleep(60), "no answer within 0.5 s"),
     ],
 )
