@@ -21,7 +21,8 @@ OPEN = {
     "ratio": (lambda a, b, v: torch.sin(v * a / b), [POSITIVE] * 2, ["a / b"]),
     "shift": (friction, [POSITIVE] * 2, ["a * (b + 0.5)"]),
     "exponential": (
-        *(lambda a, b, v: v * a * torch.exp(-b), [POSITIVE, CENTERED]),
+        lambda a, b, v: v * a * torch.exp(-b),
+        [POSITIVE, CENTERED],
         ["a * exp(-b)"],
     ),
     "three": (lambda a, b, c, v: v * a * b / c, [POSITIVE] * 3, ["a * b / c"]),

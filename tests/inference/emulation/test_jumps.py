@@ -1,4 +1,4 @@
-"""Jumps that lie between few rows: a belief is right, or says that it may not be."""
+"""Jumps and noise that few rows do not follow: a belief is right, or has doubts."""
 
 from dataclasses import replace
 
