@@ -193,6 +193,15 @@ def test_effects_of_rows_may_be_changed():
         assert torch.equal(mean - 1, THETA[:4])
 
 
+def test_simulations_keep_the_theta_that_was_simulated():
+    theta, action = THETA.clone(), ACTION.clone()
+    rows = simulate(changing, theta, action, seed=0)
+    theta.zero_()
+    action.zero_()
+    assert torch.equal(rows.theta, THETA)
+    assert torch.equal(rows.action, ACTION)
+
+
 def test_noise_keeps_the_values_that_were_declared():
     sd, times = torch.ones(2, dtype=torch.float64), np.arange(3.0)
     noise = GaussianNoise(sd).at(times)

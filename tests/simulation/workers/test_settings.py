@@ -107,27 +107,40 @@ STOPS = {"stop": 3}
 BOTH = {"refinement": RefinementOptions(workers=Workers(2))}
 #: Settings, what cannot be, and what is said of it.
 REFUSED = [
+    (Workers, {"num_workers": 0}, "num_workers >= 1, or -1 for one a core; got 0"),
     (Workers, {"num_workers": "two"}, "num_workers >= 1, or -1 for .*; got 'two'"),
     (Workers, {"time_limit": 0.0}, "time_limit > 0 or None; got 0.0; use None"),
     (Workers, {"num_retries": -1}, "num_retries >= 0; got -1; use 0 to try once"),
     (RefinementOptions, {"defensive": 0.6}, "defensive <= 0.5; got 0.6"),
+    (RefinementOptions, {"defensive": 0}, "defensive >= 1e-06; got 0"),
     (RefinementOptions, {"workers": 2}, "workers of class Workers; got 2"),
     (MixtureDensity, {"hidden_features": (8, 0)}, "hidden_features >= 1; got 0"),
+    (MixtureDensity, {"details": 3}, "details of class MixtureDetails; got 3"),
     (MixtureDetails, {"learning_rate": 0}, "learning_rate > 0; got 0; use 1e-3"),
     (MixtureDetails, {"activation": "tanh"}, "activation among 'silu', 'relu'"),
+    (RatioClassifier, {"num_iterations": 0}, "num_iterations >= 1; got 0"),
     (LFIRE, {"num_marginal": 9}, "num_marginal >= 10; got 9"),
+    (CampaignDetails, {"num_scored": 5}, "num_scored >= 100; got 5"),
     (CampaignDetails, {"look_ahead": 3}, "look_ahead among 1, 2; got 3"),
     (CampaignOptions, {"estimator": "foo"}, "estimator among 'auto', .*; got 'foo'"),
     (CampaignOptions, {"network": "never"}, "network among 'each round', .*'never'"),
     (CampaignOptions, {"refine": 3}, "refine of class bool; got 3; pass True or"),
     (CampaignOptions, STOPS, r"stop of class StopRules; got 3; pass StopRules\("),
+    (CampaignOptions, {"refinement": {}}, "refinement of class RefinementOptions; got"),
     (CampaignOptions, {"details": None}, "details of class CampaignDetails; got None"),
     (CampaignOptions, {"num_simulations": "many"}, "num_simulations >= 100; got 'many"),
+    (CampaignOptions, {"num_simulations": 99}, "num_simulations >= 100; got 99"),
+    (CampaignOptions, {"num_samples": 7}, "num_samples >= 8; got 7"),
     (CampaignOptions, {"max_simulations": 99}, "max_simulations >= 100 or None; got"),
+    (CampaignOptions, {"planned_trials": 0}, "planned_trials >= 1; got 0"),
+    (CampaignOptions, {"check_every": 0}, "check_every >= 1 or None; got 0"),
     (CampaignOptions, BOTH, ".*to run as all others"),
     (StopRules, {"budget": 0.0}, "budget > 0 or None; got 0.0"),
-    (StopRules, {"max_sd": [0.1, 0.0]}, "max_sd > 0 or None"),
-    (StopRules, {"min_information_gain": -1.0}, "min_information_gain > 0"),
+    *(
+        (StopRules, {"max_sd": v}, "max_sd > 0 or None")
+        for v in (0.0, -1.0, [0.1, 0.0])
+    ),
+    *((StopRules, {"min_information_gain": v}, "min_inf.*> 0") for v in (0.0, -1.0)),
 ]
 
 
