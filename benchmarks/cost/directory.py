@@ -2,8 +2,8 @@
 
     python -m benchmarks cost.directory
 
-* a ``tell`` of 100 numbers, in memory and on disk, and the ``fsync`` alone of a file of
-  as many bytes, in turn;
+* a ``tell`` of 100 numbers of a trial that was asked for, in memory and on disk, and the
+  ``fsync`` alone of a file of as many bytes, in turn;
 * ``Campaign.load`` of a campaign of 200 trials of 100 numbers, and of its belief, which
   was inferred from all of them at once.
 
@@ -35,7 +35,7 @@ from sbi_active import (
     RefinementOptions,
     SimulatorModel,
 )
-from sbi_active.campaign.options import CampaignDetails
+from sbi_active.campaign.telling import Facts
 from sbi_active.seeding import forked_generators
 
 RESULT = Path(__file__).with_suffix(".json")
@@ -44,7 +44,6 @@ PRIOR = BoxUniform(torch.zeros(2), torch.ones(2))
 ACTIONS = BoxActions([0.5], [2.0])
 OPTIONS = CampaignOptions(
     network="on demand",
-    details=CampaignDetails(num_scored=500),
     refinement=RefinementOptions(num_histories=1_000),
 )
 THETA = torch.tensor([[0.3, 0.6]])
@@ -85,8 +84,9 @@ def tells(folder: Path) -> dict[str, float]:
     times: dict[str, list[float]] = {"memory": [], "disk": [], "fsync": []}
     for index in range(REPEATS):
         action, x = trial(index)
-        times["memory"].append(milliseconds(partial(in_memory.attach, action, x)))
-        times["disk"].append(milliseconds(partial(on_disk.attach, action, x)))
+        for name, campaign in (("memory", in_memory), ("disk", on_disk)):
+            campaign._record("asked", Facts(index, action.tolist()))
+            times[name].append(milliseconds(partial(campaign.tell, x)))
         times["fsync"].append(milliseconds(lambda: _synchronized(folder / "bytes")))
     on_disk.close()
     return {name: round(median(values), 2) for name, values in times.items()}
