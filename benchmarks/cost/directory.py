@@ -2,8 +2,8 @@
 
     python -m benchmarks cost.directory
 
-* a ``tell`` of 100 numbers of a trial that was asked for, in memory and on disk, and the
-  ``fsync`` alone of a file of as many bytes, in turn;
+* a ``tell`` of 100 numbers of a trial that was asked for, in memory and on disk, and
+  the ``fsync`` alone of a file of as many bytes, in turn;
 * ``Campaign.load`` of a campaign of 200 trials of 100 numbers, and of its belief, which
   was inferred from all of them at once.
 
