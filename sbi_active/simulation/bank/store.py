@@ -43,8 +43,8 @@ SCHEMA = (
 #: A record is changed in its place: one that moved to the end would touch more pages.
 WRITE = "INSERT INTO records VALUES (?, ?, ?, ?) ON CONFLICT DO UPDATE SET "
 WRITE += "digest = excluded.digest, content = excluded.content"
-#: The log begins anew before it outgrows the room that it gets: with twice of both, the
-#: first commit of a process takes twice as long, and with half, blocks of rows do.
+#: The log begins anew before it outgrows its room. With four times of both, the first
+#: commit of a process takes twice as long; with a quarter, blocks of rows do.
 SETTINGS = (
     "PRAGMA trusted_schema = OFF; PRAGMA cell_size_check = ON; PRAGMA journal_mode = "
     "WAL; PRAGMA synchronous = FULL; PRAGMA wal_autocheckpoint = 240; BEGIN"
@@ -52,7 +52,6 @@ SETTINGS = (
 #: Seconds to wait for a moment in which another process tidies up. A choice.
 PATIENCE = 10.0
 OTHERWISE = "or bring what is there from before up to date by: sbi-active migrate"
-
 #: SQLite's errors that say nothing against the file.
 OF_THE_DISK = re.compile("locked|full|readonly|disk I/O|unable to open|too big")
 
@@ -313,14 +312,15 @@ class Store:
             form = execute("PRAGMA user_version").fetchone()[0]
             self._id = execute("PRAGMA application_id").fetchone()[0]
             tables = execute("SELECT sql FROM sqlite_master").fetchall()
+            if self._lock is not None:
+                execute("COMMIT")
         expected, got = f"a {self._what} of format {FORMAT}", f"{form} in {path}"
         require(form == FORMAT, expected, got, "use the release that wrote it")
         is_own = tables == [(SCHEMA,), (None,)]  # the table, and the index of its key
         whole(path, is_own, "tables that are not those of a store")
         if self._lock is not None:
-            execute("COMMIT")
-            # Into a log that need not grow, a commit takes half of the time or less.
-            # This is room for 254 pages; where the disk has none, it is as well.
+            # Into a log that need not grow, here for 254 pages, a commit takes half of
+            # the time or less. Where the disk has no room, it is as well.
             with suppress(OSError), open(f"{path}-wal", "r+b") as log:
                 if log.seek(0, os.SEEK_END) == 0:
                     log.write(bytes(2**20))
