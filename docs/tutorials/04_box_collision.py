@@ -14,7 +14,7 @@ from sbi_active import Campaign, CampaignOptions
 from sbi_active.tasks import get_task
 
 task = get_task("box_collision")
-print(task.parameter_names, task.theta_true.tolist())
+print(task.parameter_names, task.theta_true)
 print(task.actions)
 
 # %%

@@ -140,7 +140,7 @@ def _trial_axis(ax: Axes, residuals: Any) -> None:
 
 
 def _residual_axis(ax: Axes, each: Array) -> None:
-    ax.axhspan(-2, 2, color="#e9edf0", zorder=0)
+    ax.axhspan(-2, 2, color="#dde3e8", zorder=0)
     ax.axhline(0, color="#555555", lw=0.8, zorder=0)
     finite = each[np.isfinite(each)]
     largest = max(float(np.abs(finite).max(initial=0.0)) * 1.15, 3.5)
