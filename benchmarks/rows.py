@@ -135,6 +135,8 @@ def benchmark(
         axes: Values of what makes a case; ranges vary slowest. Each is an option, a
             range by its ends and in the plural: ``--seeds 0 10``.
     """
+    taken = [*inspect.signature(make).parameters]  # by place; names may be others
+    assert all(k not in taken or taken[i] == k for i, k in enumerate(axes)), taken
     ranges = {key: axis for key, axis in axes.items() if isinstance(axis, range)}
     option = {key: key + "s" * (key in ranges) for key in axes}
     slowest = sorted(axes, key=lambda k: k not in ranges)

@@ -144,6 +144,6 @@ main = benchmark(
     RESULTS / "beliefs.csv",
     judged,
     summary,
-    seed=range(2300, 2340),
     parameters=(8, 12, 16, 20),
+    seed=range(2300, 2340),
 )

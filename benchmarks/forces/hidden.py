@@ -79,8 +79,10 @@ class Hidden:
             options["force"] = {self.force: torch.stack([size, place], 1)}
         elif self.name == DELAY:
             options["delay"] = self.size
-        num = machine.num_simulated
-        x = machine.model.fn(theta.expand(len(action), -1), action, **options)
+        num, model = machine.num_simulated, machine.model
+        if model.sample_times is not None and "times" in model.conditions:
+            options["times"] = model.sample_times.expand(len(action), -1)
+        x = model.fn(theta.expand(len(action), -1), action, **options)
         machine.num_simulated = num  # the truth's are not the verdict's
         return x
 
