@@ -144,5 +144,5 @@ main = benchmark(
     may_fail=True,
     group=GROUPS,
     kind=KINDS,
-    case=range(2_580, 2_718),
+    case=range(2_580, 2_740),
 )

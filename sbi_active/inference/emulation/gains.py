@@ -20,7 +20,7 @@ from scipy.special import logsumexp
 from torch import Tensor
 
 from sbi_active.arrays import Array
-from sbi_active.inference.emulation.emulator import interpolated
+from sbi_active.inference.emulation.emulator import interpolated, nearest_rows
 from sbi_active.inference.emulation.outcomes import (
     Summary,
     is_short,
@@ -71,7 +71,7 @@ def candidate_gains(
     rows = pool.rows
     z, action = coordinates.to_z(rows.theta), rows.action.double().numpy()
     region = around(reference)
-    near = np.sort(np.argsort(region.distance(z), kind="stable")[:most_rows])
+    near = np.sort(nearest_rows(region, z, most_rows))
     region = region.sized(z[near])
     rng = np.random.default_rng(derive_seed(seed, "outcomes"))
     draws = reference[rng.integers(len(reference), size=num_outer + num_inner)]
