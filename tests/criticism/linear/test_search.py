@@ -12,8 +12,8 @@ from sbi_active.criticism.linear import screening
 from sbi_active.criticism.linear.fits import FitSettings
 from sbi_active.criticism.linear.search import Search
 from sbi_active.criticism.results import ModelKey
-from sbi_active.criticism.steps.detection import log_priors
 from sbi_active.criticism.steps import equivalence
+from sbi_active.criticism.steps.detection import log_priors
 from tests.effects import louder, on_outcomes
 
 SENSOR, NUM_TRIALS, LIMIT, SLOPE = 0.5, 14, 14.0, 2.0
