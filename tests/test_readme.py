@@ -5,6 +5,7 @@ A snippet whose first line is ``# name.py`` is a file, from which others may imp
 
 import re
 import sys
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -14,6 +15,7 @@ import torch
 from sbi_active import InformationGainDesigner
 from sbi_active.campaign.learning import planner
 from sbi_active.campaign.learning.learner import Learner
+from sbi_active.criticism import next_action
 from sbi_active.design import GradientSearch
 from sbi_active.inference.networks.mixture_density import TrainingRecord, train_network
 from sbi_active.inference.trainers import action_rounds
@@ -71,6 +73,8 @@ def run(tmp_path, monkeypatch):
             monkeypatch.setattr(planner, "InformationGainDesigner", of_few_simulations)
             monkeypatch.setattr(Learner, "trains_each_round", False)
             monkeypatch.setattr(action_rounds, "train_network", of_few_steps)
+            plan = replace(next_action.PLAN, samples=40)
+            monkeypatch.setattr(next_action, "PLAN", plan)
         text = (ROOT / name).read_text()
         for snippet in re.findall(r"```python\n(.*?)```", text, re.DOTALL):
             file = FILE.match(snippet)
