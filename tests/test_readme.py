@@ -5,7 +5,6 @@ A snippet whose first line is ``# name.py`` is a file, from which others may imp
 
 import re
 import sys
-from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -15,7 +14,6 @@ import torch
 from sbi_active import InformationGainDesigner
 from sbi_active.campaign.learning import planner
 from sbi_active.campaign.learning.learner import Learner
-from sbi_active.criticism import next_action
 from sbi_active.design import GradientSearch
 from sbi_active.inference.networks.mixture_density import TrainingRecord, train_network
 from sbi_active.inference.trainers import action_rounds
@@ -54,7 +52,7 @@ pytestmark = [
 
 
 @pytest.fixture
-def run(tmp_path, monkeypatch):
+def run(tmp_path, monkeypatch, few_draws):
     """Return a function that runs a page, and returns the names of each snippet.
 
     README runs as printed. On the other pages a network is trained where something asks
@@ -73,8 +71,6 @@ def run(tmp_path, monkeypatch):
             monkeypatch.setattr(planner, "InformationGainDesigner", of_few_simulations)
             monkeypatch.setattr(Learner, "trains_each_round", False)
             monkeypatch.setattr(action_rounds, "train_network", of_few_steps)
-            plan = replace(next_action.PLAN, samples=40)
-            monkeypatch.setattr(next_action, "PLAN", plan)
         text = (ROOT / name).read_text()
         for snippet in re.findall(r"```python\n(.*?)```", text, re.DOTALL):
             file = FILE.match(snippet)

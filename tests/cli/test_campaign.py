@@ -61,7 +61,9 @@ def line(theta, action):
 """
 
 
-def test_a_missing_effect_is_found_and_adopted(capsys, monkeypatch, tmp_path):
+def test_a_missing_effect_is_found_and_adopted(
+    capsys, monkeypatch, tmp_path, few_draws
+):
     monkeypatch.setattr(problem, "generic_effects", lambda *_, **__: [])
     Path("line.py").write_text(LINE)
     Path("tape.py").write_text(TAPE)
