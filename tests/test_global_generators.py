@@ -74,7 +74,6 @@ def test_a_campaign(kept):
     kept("to_inference_data", lambda: to_inference_data(c, num_samples=20))
     kept("withdraw", lambda: c.withdraw(0))
     kept("again", c.update)
-    kept("run", lambda: c.run(lambda action: 0.6 * action, num_rounds=1))
 
 
 @pytest.mark.parametrize("make", [ASBI, ALHI, SeqBED])

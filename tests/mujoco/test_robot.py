@@ -14,6 +14,7 @@ from sbi_active.criticism import Trials
 from sbi_active.mujoco import from_mjcf
 from sbi_active.mujoco.robot import Robot
 from sbi_active.simulation import Outcome, simulate
+from tests.campaign.problem import REFINEMENT
 from tests.mujoco.machines import stepped
 
 RELEASE = BoxActions([-1.5], [1.5], names=["hinge"])
@@ -159,7 +160,7 @@ def test_what_does_not_fit_is_said(change, message):
 
 def test_the_belief_of_a_campaign_is_kept(tmp_path):
     robot = pendulum()
-    few = CampaignOptions(network="on demand", num_simulations=200, num_samples=32)
+    few = CampaignOptions(network="on demand", refinement=REFINEMENT)
     parts = robot.simulator, robot.prior, robot.actions
     truth, action = torch.tensor([[0.03, 1.0]]), robot.actions.sample((1,), seed=0)
     with Campaign(*parts, directory=tmp_path / "c", seed=0, options=few) as campaign:

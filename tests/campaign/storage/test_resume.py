@@ -227,7 +227,7 @@ def test_another_prior_or_space_is_refused(tmp_path):
 
 def test_adopted_effects_come_back(tmp_path):
     campaign = new(tmp_path / "c", simulator=MODEL, effects=[BIAS])
-    for index, action in enumerate(torch.linspace(0.5, 2.0, 4)):
+    for index, action in enumerate(torch.linspace(0.5, 2.0, 3)):
         campaign.attach([float(action)], outcome(action[None], index) + 0.5)
     report = campaign.criticize(evaluate=False)
     assert report.verdict == "bias"

@@ -74,7 +74,8 @@ def test_the_other_way_separates_a_tilt():
     assert float(chosen.outside[0]) < 0
     assert {*chosen.outside_separates} == {"none", "tilt"}
     assert chosen.outside_gain > 0.1
-    stops = choose_action(c.rivals, only(c, "none", "tilt"), FORWARD)
+    two = only(c, "none", "tilt")
+    stops = choose_action(c.rivals, two, FORWARD, outside=False)
     assert stops.action is None
     assert stops.information_gain.max() < 0.02
     assert {*stops.separates} == {"none", "tilt"}
