@@ -60,7 +60,7 @@ def kept():
     assert changed == []
 
 
-def test_a_campaign(kept):
+def test_a_campaign(kept, few_draws):
     c = kept("Campaign", lambda: campaign("asbi", by_numpy, network="each round"))
     trial = kept("ask", c.ask)
     kept("tell", lambda: c.tell(0.6 * trial.action))

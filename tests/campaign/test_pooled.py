@@ -164,7 +164,7 @@ def test_rows_lost_to_faults_are_counted_once():
         return torch.from_numpy(x)
 
     model = SimulatorModel(fails, batched=False)
-    options = {"max_simulations": 400, "planned_trials": 2, "refinement": FEW}
+    options = {"max_simulations": 250, "planned_trials": 2, "refinement": FEW}
     c = Campaign(model, PRIOR, DiscreteActions([0.5, 1.0]), options=options)
     c.run(lambda action: torch.tensor([0.6 * float(action[0]), 0.3]), num_rounds=2)
     c.update()

@@ -11,7 +11,7 @@ import pytest
 from matplotlib import image
 
 from sbi_active.cli import main, problem
-from tests.cli.sled import SMALL, read
+from tests.cli.sled import SIZES, SMALL, read
 
 
 def answer(capsys, *words):
@@ -99,7 +99,8 @@ def test_python_has_the_command_line():
 
 def test_run_writes_table_and_figure(capsys):
     words = ["run", "numerical", "--rounds", "2", "--out", "a"]
-    assert main([*words, "--set", "num_simulations=200"]) == 0
+    words += [f"--set={size}" for size in (*SIZES, "num_samples=100")]
+    assert main(words) == 0
     printed = capsys.readouterr().out
     assert "the truth: " in printed
     assert "a/loop.png" in printed

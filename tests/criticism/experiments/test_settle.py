@@ -19,6 +19,8 @@ from sbi_active.criticism.experiments.settle import NAME, VerdictError, settle
 from tests.criticism.misfit import oscillator
 from tests.effects import added
 
+pytestmark = pytest.mark.usefixtures("few_draws")
+
 NOISE = 0.1
 PRIOR = BoxUniform(-3 * torch.ones(1), 3 * torch.ones(1))
 MODEL = SimulatorModel(

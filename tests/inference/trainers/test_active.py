@@ -34,7 +34,7 @@ def simulator(theta, action):
 def round_of(inference):
     """Return a trainer after a round, small as it is."""
     torch.manual_seed(0)
-    theta, action = PRIOR.sample((400,)), torch.ones(400, 1)
+    theta, action = PRIOR.sample((200,)), torch.ones(200, 1)
     theta, action = inference.arrange(theta, action)
     inference.append_simulations(theta, simulator(theta, action), action=action)
     inference.train(max_num_epochs=2)

@@ -232,9 +232,9 @@ def test_seqbed_weighs_particles():
 
 
 def test_amortized_ratios_meet_the_closed_form():
-    classifier = RatioClassifier(hidden_features=(32,), num_iterations=150)
+    classifier = RatioClassifier(hidden_features=(32,), num_iterations=100)
     inference = SeqBED(PRIOR, classifier, show_progress_bars=False)
-    theta, x, action = rows(3_000)
+    theta, x, action = rows(2_000)
     inference.append_simulations(theta, x, action=action).train()
     model = inference.build_posterior()
     with torch.no_grad():
