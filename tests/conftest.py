@@ -1,8 +1,11 @@
 import gc
 import signal
+from dataclasses import replace
 
 import pytest
 import torch
+
+from sbi_active.criticism import next_action
 
 # A shell that starts the tests in the background has SIGINT ignored, which children
 # inherit: those that a test interrupts would never end.
@@ -15,6 +18,12 @@ torch.set_num_threads(1)
 def pytest_collection_finish():
     """Have the collector pass over what was imported: a million objects, each time."""
     gc.freeze()
+
+
+@pytest.fixture
+def few_draws(monkeypatch):
+    """Have the next action be planned by few draws of each rival."""
+    monkeypatch.setattr(next_action, "PLAN", replace(next_action.PLAN, samples=40))
 
 
 @pytest.fixture(autouse=True)

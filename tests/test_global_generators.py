@@ -60,7 +60,7 @@ def kept():
     assert changed == []
 
 
-def test_a_campaign(kept):
+def test_a_campaign(kept, few_draws):
     c = kept("Campaign", lambda: campaign("asbi", by_numpy, network="each round"))
     trial = kept("ask", c.ask)
     kept("tell", lambda: c.tell(0.6 * trial.action))
@@ -74,7 +74,6 @@ def test_a_campaign(kept):
     kept("to_inference_data", lambda: to_inference_data(c, num_samples=20))
     kept("withdraw", lambda: c.withdraw(0))
     kept("again", c.update)
-    kept("run", lambda: c.run(lambda action: 0.6 * action, num_rounds=1))
 
 
 @pytest.mark.parametrize("make", [ASBI, ALHI, SeqBED])

@@ -46,11 +46,11 @@ def test_only_packages_have_public_names():
 
 def test_importing_it_imports_nothing_heavy():
     code = (
-        "import sys, sbi_active; before = {*sys.modules}; sbi_active.GaussianNoise; "
-        "print(before & {'torch', 'numpy', 'sbi', 'attr'}, 'torch' in sys.modules)"
+        "import sys, sbi_active; dir(sbi_active); "
+        "print({*sys.modules} & {'torch', 'numpy', 'sbi', 'attr'})"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
-    assert done.stdout == "set() True\n", done.stderr
+    assert done.stdout == "set()\n", done.stderr
 
 
 @pytest.mark.parametrize(("package", "old", "new"), former_names())

@@ -15,6 +15,8 @@ from sbi_active import InformationGainDesigner
 from sbi_active.campaign.learning import planner
 from sbi_active.campaign.learning.learner import Learner
 from sbi_active.design import GradientSearch
+from sbi_active.inference.networks.mixture_density import TrainingRecord, train_network
+from sbi_active.inference.trainers import action_rounds
 
 ROOT = Path(__file__).parents[1]
 FILE = re.compile(r"# (\w+)\.py\n")
@@ -50,11 +52,11 @@ pytestmark = [
 
 
 @pytest.fixture
-def run(tmp_path, monkeypatch):
+def run(tmp_path, monkeypatch, few_draws):
     """Return a function that runs a page, and returns the names of each snippet.
 
     README runs as printed. On the other pages a network is trained where something asks
-    for it, and a search for the next action is short and of few simulations.
+    for it, and soon, and a search for the next action is short and of few simulations.
     """
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.chdir(tmp_path)
@@ -68,6 +70,7 @@ def run(tmp_path, monkeypatch):
             monkeypatch.setattr(GradientSearch, "num_starts", 4)
             monkeypatch.setattr(planner, "InformationGainDesigner", of_few_simulations)
             monkeypatch.setattr(Learner, "trains_each_round", False)
+            monkeypatch.setattr(action_rounds, "train_network", of_few_steps)
         text = (ROOT / name).read_text()
         for snippet in re.findall(r"```python\n(.*?)```", text, re.DOTALL):
             file = FILE.match(snippet)
@@ -85,7 +88,11 @@ def run(tmp_path, monkeypatch):
 
 
 def of_few_simulations(actions, **options) -> InformationGainDesigner:
-    return InformationGainDesigner(actions, **{**options, "num_samples": 200})
+    return InformationGainDesigner(actions, **{**options, "num_samples": 100})
+
+
+def of_few_steps(*args, num_iterations, **options) -> TrainingRecord:
+    return train_network(*args, num_iterations=min(num_iterations, 20), **options)
 
 
 def forget():

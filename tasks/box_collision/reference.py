@@ -42,7 +42,7 @@ def exact_posterior(
         >>> task = get_task("box_collision")
         >>> x = task.real_system(torch.tensor([5.0]), seed=0)
         >>> trial = Trial(0, torch.tensor([5.0]), x, "ok")
-        >>> posterior = exact_posterior(task, [trial], num_particles=50)
+        >>> posterior = exact_posterior(task, [trial], num_particles=20)
         >>> bool(posterior.log_evidence_se < 0.2)
         True
     """

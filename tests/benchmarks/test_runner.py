@@ -1,10 +1,8 @@
 """One command runs every benchmark, and README's table is what rows say."""
 
 import re
-from collections.abc import Sequence
 from importlib import import_module
 from pathlib import Path
-from typing import Annotated, Literal
 
 import pytest
 
@@ -13,33 +11,6 @@ from benchmarks.__main__ import HERE, benchmarks, main, module_of, parser_of
 from benchmarks.rows import benchmark, read
 
 ROOT = Path(__file__).parents[2]
-
-
-def test_options_are_arguments():
-    def run(
-        *,
-        summary: bool = False,
-        seeds: list[int] | None = None,
-        path: Path = ROOT,
-        kind: Literal["a", "b"] | None = None,
-        names: Annotated[Sequence[str], {"x": 1, "y": 2}] = ("x",),
-        first_pair: tuple[int, int] = (1, 2),
-    ) -> None:
-        """Run.
-
-        Args:
-            summary: Whether to run nothing.
-        """
-
-    parse = parser_of(run, "some").parse_args
-    assert vars(parse([])) == run.__kwdefaults__
-    options = "--summary --seeds 1 2 --path a --kind b --names y x --first-pair 3 4"
-    given = {"summary": True, "seeds": [1, 2], "path": Path("a"), "kind": "b"}
-    given |= {"names": ["y", "x"], "first_pair": [3, 4]}
-    assert vars(parse(options.split())) == given
-    for wrong in ("--seeds one", "--kind c", "--names z", "--first-pair 1"):
-        with pytest.raises(SystemExit):
-            parse(wrong.split())
 
 
 def test_cases_are_run_once_and_those_that_are_asked_for_are_told(tmp_path, capsys):

@@ -21,7 +21,7 @@ from benchmarks.measured.cascaded_tanks import fit_tanks, score
 from benchmarks.measured.removals import removed, table
 from benchmarks.misfit import cases as misfit_cases
 from benchmarks.misfit.summary import summary
-from benchmarks.robustness.run import by_tests
+from benchmarks.robustness import run as robustness
 from benchmarks.rows import read
 from benchmarks.search import run as search
 from benchmarks.target import cart_pole as target
@@ -137,10 +137,17 @@ def test_an_effect_hidden_in_a_robot_shows_and_no_parameter_absorbs_it():
     assert (apart**2).sum() >= excess * 0.999
 
 
-def test_a_test_that_fails_was_not_survived():
-    rows = [*by_tests(("tests/test_seeding.py",))]
-    assert rows
-    assert all(row["survived"] and "seeding" in row["attack"] for row in rows)
+def test_a_test_that_fails_was_not_survived(tmp_path, monkeypatch):
+    text = "import pytest\n\n\n@pytest.mark.parametrize('k', [0, 1])\ndef test_even(k):"
+    (tmp_path / "test_own.py").write_text(f"{text}\n    assert k % 2 == 0\n")
+    monkeypatch.setattr(robustness, "ROOT", tmp_path)
+    found = {row["case"]: row for row in robustness.by_tests(("test_*.py",))}
+    assert {case: row["survived"] for case, row in found.items()} == {
+        "0": True,
+        "1": False,
+    }
+    assert found["0"]["attack"] == "test_own test_even"
+    assert "assert" in found["1"]["answer"]
 
 
 def test_a_search_comes_near_the_best_of_known_functions():

@@ -172,13 +172,13 @@ def test_pairs_tell_more_than_single_trials_for_the_same_budget():
     for look_ahead in (1, 2):
         details = CampaignDetails(num_scored=100, look_ahead=look_ahead)
         sizes = {"num_samples": 64, "details": details}
-        options = evolve(OPTIONS, stop=StopRules(budget=16.0), **sizes)
+        options = evolve(OPTIONS, stop=StopRules(budget=6.0), **sizes)
         model = SimulatorModel(measure, noise=GaussianNoise(1.0))
         c = Campaign(model, prior_of(5), MEASURED, cost=trip, options=options)
         c.run(lambda action: measure(TRUTH, action[None])[0], num_rounds=20)
-        assert c.state.spent <= 16.0
+        assert c.state.spent <= 6.0
         told[look_ahead] = information(c.history)
-    assert [t.cost for t in c.history] == [5.0, 1.0, 9.0, 1.0]
-    assert told[2] == pytest.approx(2 * torch.tensor(101.0).log().item())
+    assert [t.cost for t in c.history] == [5.0, 1.0]
+    assert told[2] == pytest.approx(torch.tensor(101.0).log().item())
     assert told[1] < told[2] - 1.5
     assert "], then [" in c.history[0].design.notes[-1]

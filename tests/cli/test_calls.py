@@ -191,16 +191,13 @@ def test_an_output_that_takes_no_more(camp, how):
 
 
 def test_a_locale_that_is_not_utf8(camp):
-    env = {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONIOENCODING": ""}
-
-    def answered(*words):
-        process = run(words, stdout=subprocess.PIPE, env=env)
-        shown, error = process.communicate()
-        assert process.returncode == 0, error
-        return shown
-
-    answered(*SLED, *ASK, "--units", "µm", "--names", "größe")
+    words = [*SLED, *ASK, "--units", "µm", "--names", "größe"]
+    words = [word.encode().decode("ascii", "surrogateescape") for word in words]
+    process = forked(words, place="C", stdout=subprocess.PIPE)
+    error = process.communicate()[1]
+    assert process.returncode == 0, error
     assert main(["tell", "new", "0.3", "--action", "1"]) == 0
+    env = {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONIOENCODING": ""}
     words = ["correct", "new", "0", "0.4", "--reason", "µ", "--json"]
     shown, error = run(words, stdout=subprocess.PIPE, env=env).communicate()
     answer = read(shown)

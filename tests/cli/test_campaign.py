@@ -11,7 +11,7 @@ import pytest
 from matplotlib import image
 
 from sbi_active.cli import main, problem
-from tests.cli.sled import SMALL, read
+from tests.cli.sled import SIZES, SMALL, read
 
 
 def answer(capsys, *words):
@@ -61,13 +61,15 @@ def line(theta, action):
 """
 
 
-def test_a_missing_effect_is_found_and_adopted(capsys, monkeypatch, tmp_path):
+def test_a_missing_effect_is_found_and_adopted(
+    capsys, monkeypatch, tmp_path, few_draws
+):
     monkeypatch.setattr(problem, "generic_effects", lambda *_, **__: [])
     Path("line.py").write_text(LINE)
     Path("tape.py").write_text(TAPE)
     words = ["--simulator", "line.py:line", "--theta-low", "0", "--theta-high", "1"]
     assert main(["init", "camp", *words, "--actions", "1,2,3", *SMALL]) == 0
-    for index, action in enumerate((1, 2, 3, 1, 2, 3)):
+    for index, action in enumerate((1, 2, 3, 1)):
         x = f"{0.5 * action + 0.3 + 0.02 * (-1) ** index:.4f}"
         assert main(["tell", "camp", x, "--action", str(action)]) == 0
     assert main(["criticize", "camp"]) == 0
@@ -97,7 +99,8 @@ def test_python_has_the_command_line():
 
 def test_run_writes_table_and_figure(capsys):
     words = ["run", "numerical", "--rounds", "2", "--out", "a"]
-    assert main([*words, "--set", "num_simulations=200"]) == 0
+    words += [f"--set={size}" for size in (*SIZES, "num_samples=100")]
+    assert main(words) == 0
     printed = capsys.readouterr().out
     assert "the truth: " in printed
     assert "a/loop.png" in printed

@@ -27,8 +27,8 @@ def broken(theta, action):
 def camp(tmp_path):
     """A campaign without trials."""
     (tmp_path / "sled.py").write_text(SIMULATOR + LOUD)
-    words = ["--actions", "0.5:3", "--simulator", "sled.py:loud"]
-    sizes = [*SMALL, "--set", "num_samples=200"]
+    words = ["--actions", "1,2", "--simulator", "sled.py:loud"]
+    sizes = [*SMALL, "--set", "num_samples=100"]
     assert main(["init", "camp", *BOX, *sizes, *words]) == 0
 
 
@@ -65,26 +65,22 @@ def test_a_robot_s_loop(server):
     assert server.says({"command": "tell", "x": 0.7, "action": 1})["answer"]
     assert main(["tell", "camp", "0.9", "--action", "2"]) == 0
     assert len(server.says({"command": "status"})["answer"]["trials"]) == 2
-    assert server.says({"command": "tell", "x": 0.8, "action": 1})["answer"]
-    assert main(["status", "camp"]) == 0
     asked = server.says({"command": "ask", "id": 7})
     assert asked["id"] == 7
     assert asked["answer"]["names"] == ["action"]
     told = server.says({"command": "tell", "x": 0.7, "trial": asked["answer"]["trial"]})
     assert told["answer"]["x"] == [pytest.approx(0.7)]
     assert told["answer"]["status"] == "ok"
-    again = {"command": "correct", "trial": 0, "x": [0.71], "reason": "read off"}
-    assert server.says(again)["answer"]["reason"] == "read off"
     updated = server.says({"command": "update"})["answer"]
     assert updated["not_in_belief"] == []
+    again = {"command": "correct", "trial": 0, "x": [0.71], "reason": "read off"}
+    assert server.says(again)["answer"]["reason"] == "read off"
     # The campaign that is open is not taken for what another process made of it.
     assert main(["tell", "camp", "0.6", "--action", "2"]) == 0
-    assert len(server.says({"command": "status"})["answer"]["trials"]) == 5
+    assert len(server.says({"command": "status"})["answer"]["trials"]) == 4
     missed = server.says({"command": "tell", "missing": True, "action": [2.0]})
     assert missed["answer"]["action"] == [2.0]
     assert missed["answer"]["status"] == "missing"
-    saved = server.says({"command": "report", "out": "page.html"})
-    assert saved == {"answer": {"saved": "page.html"}}
     status, error = server.ends()
     assert status == 0, error
     assert "simulating" in error

@@ -1,6 +1,7 @@
 """What is executed, and when: nothing that somebody else put into a folder."""
 
 import json
+import subprocess
 import sys
 from pathlib import Path
 
@@ -120,8 +121,9 @@ def test_what_stands_beside_somebody_is_not_imported(mine, tmp_path):
     for name in ("torch", "sqlite3", "mine"):
         text = f"from pathlib import Path\n{RUN.format(tmp_path / 'stood')}"
         (tmp_path / "camp" / f"{name}.py").write_text(text)
-    words, env = ["report", "."], {"PYTHONPATH": str(ROOT)}
-    process = run(words, cwd=tmp_path / "camp", env=env)
+    words, env = ["status", "."], {"PYTHONPATH": str(ROOT)}
+    pipes = {"stdout": subprocess.DEVNULL, "cwd": tmp_path / "camp"}
+    process = run(words, env=env, **pipes)
     assert process.wait() == 0, process.stderr.read()
     assert not (tmp_path / "stood").exists()
     assert not mine.exists()

@@ -18,7 +18,7 @@ import pytest
 from sbi_active import Campaign
 from sbi_active.campaign.watch import server_of
 from sbi_active.cli import main
-from tests.cli.sled import run
+from tests.cli.sled import forked
 from tests.display.browser import assert_reads_well
 from tests.display.driver import browser
 from tests.simulation.bank.filled import execute
@@ -62,7 +62,7 @@ def watched(folder):
 
 def test_the_page_follows_a_campaign_of_another_process(camp, tmp_path):
     before = {p.name: p.read_bytes() for p in camp.iterdir()}
-    process = run(["watch", "camp"], stdout=subprocess.PIPE)
+    process = forked(["watch", "camp"], stdout=subprocess.PIPE)
     said = process.stdout.readline()
     place = re.fullmatch(r"open (http://127\.0\.0\.1:\d+), until Ctrl-C\n", said)
     assert place is not None, said

@@ -80,11 +80,11 @@ def test_given_simulations_need_no_others(estimator):
     def never(theta, action):
         raise AssertionError("nothing is to be simulated")
 
-    given = rows(8_000, ACTIONS)
+    given = rows(4_000, ACTIONS)
     design = designer.select(ExactModel(), never, simulations=given, seed=0)
     assert design.action.tolist() == [2.0]
     assert design.num_simulations == 0
-    assert int(design.num_samples.sum()) == 8_000
+    assert int(design.num_samples.sum()) == 4_000
     assert (design.estimator, design.bound) == ("PosteriorGain", "none")
     assert design.stopped == "simulations given"
     assert "too high where the model was trained on them" in design.notes[0]

@@ -61,7 +61,7 @@ def test_estimators_by_the_noise_do_not_count_presence_that_is_random(estimator)
 
 
 def test_a_network_that_knows_validity_chooses_as_the_exact_posterior():
-    """It is trained on all rows; its mean over measurements reverses the choice."""
+    """It is trained on all rows."""
     world = LUCKY
     generator = torch.Generator().manual_seed(0)
     action = ACTIONS[torch.randint(len(ACTIONS), (4_000,), generator=generator)]
@@ -77,9 +77,6 @@ def test_a_network_that_knows_validity_chooses_as_the_exact_posterior():
     assert int(mean.argmax()) == int(world.exact()["counted"].argmax()) == 2
     assert (mean < world.exact()["counted"] + 3 * error).all()  # a lower bound,
     assert mean[2] > world.exact()["validity"][2] + 3 * error[2]  # not trivial
-    valid = rows.x[..., 0].isfinite()
-    dropped = (gain * valid).sum(1) / valid.sum(1)
-    assert int(dropped.argmax()) == int(world.exact()["dropped"].argmax()) == 3
 
 
 @pytest.mark.parametrize("world", [CERTAIN, LUCKY], ids=["certain", "lucky"])
@@ -102,7 +99,7 @@ def test_dropping_invalid_rows_reverses_the_choice(world):
 
 def test_missing_rows_are_dropped_and_not_invalid():
     for world in (CERTAIN, LUCKY):
-        rows = lose_rows(world.simulations(1_000, 3), 0.4)
+        rows = lose_rows(world.simulations(600, 3), 0.4)
         for estimator in BY_LUCK[world.luck > 0]:
             gain = estimator(world, rows, PRIOR)
             assert torch.equal(gain.isnan(), rows.missing)

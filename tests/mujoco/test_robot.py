@@ -14,6 +14,7 @@ from sbi_active.criticism import Trials
 from sbi_active.mujoco import from_mjcf
 from sbi_active.mujoco.robot import Robot
 from sbi_active.simulation import Outcome, simulate
+from tests.campaign.problem import REFINEMENT
 from tests.mujoco.machines import stepped
 
 RELEASE = BoxActions([-1.5], [1.5], names=["hinge"])
@@ -45,7 +46,7 @@ def test_a_pendulum_moves_as_one_stepped_by_hand():
 
 def test_rows_do_not_depend_on_batches_or_workers():
     robot = pendulum()
-    theta, action = robot.prior.sample((70,)), RELEASE.sample((70,))
+    theta, action = robot.prior.sample((30,)), RELEASE.sample((30,))
     x = simulate(robot.simulator, theta, action, seed=0).x
     for options in ({"batch_size": 7}, {"num_workers": 2, "batch_size": 11}):
         assert (
@@ -159,11 +160,12 @@ def test_what_does_not_fit_is_said(change, message):
 
 def test_the_belief_of_a_campaign_is_kept(tmp_path):
     robot = pendulum()
-    few = CampaignOptions(network="on demand", num_simulations=300, num_samples=64)
+    few = CampaignOptions(network="on demand", refinement=REFINEMENT)
     parts = robot.simulator, robot.prior, robot.actions
-    truth = torch.tensor([[0.03, 1.0]])
+    truth, action = torch.tensor([[0.03, 1.0]]), robot.actions.sample((1,), seed=0)
     with Campaign(*parts, directory=tmp_path / "c", seed=0, options=few) as campaign:
-        belief = campaign.run(lambda a: parts[0](truth, a[None])[0], num_rounds=1)
+        campaign.attach(action[0], parts[0](truth, action)[0])
+        belief = campaign.update()
     with Campaign.load(tmp_path / "c") as read:  # as status, watch and report do
         assert not read.state.is_stale
         assert torch.equal(read.belief.mean, belief.mean)

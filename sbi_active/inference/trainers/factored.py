@@ -253,8 +253,8 @@ class SeqBED(ProductRounds, NRE_C):
         >>> from sbi.utils import BoxUniform
         >>> _ = torch.manual_seed(0)
         >>> prior = BoxUniform(-torch.ones(1), torch.ones(1))
-        >>> theta, action = prior.sample((1_000,)), torch.rand(1_000, 1)
-        >>> x = theta * action + 0.1 * torch.randn(1_000, 1)
+        >>> theta, action = prior.sample((300,)), torch.rand(300, 1)
+        >>> x = theta * action + 0.1 * torch.randn(300, 1)
         >>> inference = SeqBED(prior, show_progress_bars=False)
         >>> _ = inference.append_simulations(theta, x, action=action).train()
         >>> belief = inference.update(

@@ -14,7 +14,7 @@ from sbi_active import Campaign
 from tests.campaign.storage.campaigns import MODEL, draws, facts, go_on, new
 
 pytestmark = pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
-NUM_TRIALS, NUM_KILLED = 4, 3
+NUM_TRIALS, NUM_KILLED = 3, 3
 
 
 def has_manifest(folder):
@@ -102,7 +102,7 @@ def test_killed_again_and_again_and_resumed(tmp_path, how, whole):
             if how == "by the clock":
                 moment = {"after": rng.uniform(0.02, 0.4)}
             else:
-                moment = {"at_call": rng.randint(1, 60)}
+                moment = {"at_call": rng.randint(1, 45)}
             ended = killed(lambda folder=folder: run(folder), **moment)
             num_killed += not ended
             now = told_of(folder)

@@ -73,8 +73,6 @@ def test_read(folder):
 def test_gone_on_with_to_the_last_bit(folder):
     def finished(campaign):
         campaign.tell([0.4, 0.7, 1.0])
-        campaign.update()
-        campaign.tell([0.5, 0.8, 1.1], action=[1.2])
         torch.manual_seed(0)
         return campaign.update().sample((300,))
 

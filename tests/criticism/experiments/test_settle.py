@@ -19,6 +19,8 @@ from sbi_active.criticism.experiments.settle import NAME, VerdictError, settle
 from tests.criticism.misfit import oscillator
 from tests.effects import added
 
+pytestmark = pytest.mark.usefixtures("few_draws")
+
 NOISE = 0.1
 PRIOR = BoxUniform(-3 * torch.ones(1), 3 * torch.ones(1))
 MODEL = SimulatorModel(
@@ -26,7 +28,7 @@ MODEL = SimulatorModel(
 )
 #: Trials so far were all forward; the robot may go back as well.
 FORWARD = torch.tensor([1.0, 1.5, 2.0, 2.5, 3.0, 1.0, 2.0, 3.0])[:, None]
-BOTH = DiscreteActions(torch.tensor([-3.0, -2.0, -1.0, 1.0, 1.5, 2.0, 2.5, 3.0]))
+BOTH = DiscreteActions([-3.0, -1.0, 1.0, 3.0])
 
 
 #: Forward they are the same to the last bit, backward they have opposite signs.

@@ -1,17 +1,19 @@
 """Where fits of sets of effects begin, in libraries of any size."""
 
 import numpy as np
+import pytest
 import torch
 from sbi.utils import BoxUniform
 from torch.distributions import Independent, Uniform
 
 from sbi_active import GaussianNoise, SimulatorModel
 from sbi_active.criticism import Criticism, Trials
+from sbi_active.criticism.linear import screening
 from sbi_active.criticism.linear.fits import FitSettings
 from sbi_active.criticism.linear.search import Search
 from sbi_active.criticism.results import ModelKey
+from sbi_active.criticism.steps import equivalence
 from sbi_active.criticism.steps.detection import log_priors
-from sbi_active.criticism.steps.equivalence import MANY
 from tests.effects import louder, on_outcomes
 
 SENSOR, NUM_TRIALS, LIMIT, SLOPE = 0.5, 14, 14.0, 2.0
@@ -63,7 +65,18 @@ def test_no_pair_is_fitted_where_linear_evidence_puts_all_behind():
     assert max(len(key.effects) for key in search.found) == 1
 
 
-# A library of 24 effects, all fitted, and one of 25, screened, say the same
+# A library of effects, all fitted, and one of one more, screened, say the same
+
+
+MANY = 10
+
+
+@pytest.fixture
+def many(monkeypatch):
+    """Libraries of fewer effects are large."""
+    for module in (screening, equivalence):
+        monkeypatch.setattr(module, "MANY", MANY)
+    monkeypatch.setattr(screening, "FITTED", MANY)
 
 
 TIMES = torch.linspace(0, 2, 30)
@@ -90,17 +103,17 @@ def loop_of(number, strength, *more):
     return Criticism(model, PRIOR, Trials(action, x), effects=effects, seed=0)
 
 
-def test_clean_trials_of_many_effects_say_none():
+def test_clean_trials_of_many_effects_say_none(many):
     assert loop_of(MANY + 1, 0.0).trace().verdict == "none"
 
 
-def test_one_effect_more_does_not_change_the_verdict():
-    few, many = (loop_of(MANY + k, 0.2).trace() for k in (0, 1))
-    assert few.verdict == many.verdict == "wave 2"
-    assert abs(few.inclusion["wave 2"] - many.inclusion["wave 2"]) < 0.1
+def test_one_effect_more_does_not_change_the_verdict(many):
+    few, more = (loop_of(MANY + k, 0.2).trace() for k in (0, 1))
+    assert few.verdict == more.verdict == "wave 2"
+    assert abs(few.inclusion["wave 2"] - more.inclusion["wave 2"]) < 0.1
 
 
-def test_what_was_set_aside_counts_in_the_prior_and_is_said():
+def test_what_was_set_aside_counts_in_the_prior_and_is_said(many):
     loop = loop_of(MANY + 6, 0.2, louder())
     report = loop.report(evaluate=False, plan=False)
     assert len(loop.rivals.effects) < len(loop.effects)

@@ -23,7 +23,7 @@ from tests.effects import BIAS, added, louder
 @pytest.fixture(scope="module")
 def loop():
     hidden = measured("sin 2q", 0.5, seed=1)
-    effects = force_effects(MODEL, PRIOR, hidden, joints=["hinge"])
+    effects = force_effects(MODEL, PRIOR, hidden, joints=["hinge"])[::6]
     return Criticism(MODEL, PRIOR, hidden, effects=effects, seed=0)
 
 

@@ -1,67 +1,53 @@
-"""Reports with figures that are made up, to test how they are told."""
+"""A report of a machine that lacks a drag, and what changes make of it."""
 
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import numpy as np
-import pandas as pd
 import torch
 from sbi.utils import BoxUniform
 
 from sbi_active import DiscreteActions, GaussianNoise, SimulatorModel
-from sbi_active.criticism import Trials, results
+from sbi_active.criticism import Trials, close_loop, results
 from sbi_active.criticism.contradictions import Misfit, ModelError, Support
 from sbi_active.criticism.report.report import build_report
-from tests.effects import on_outcomes
+from tests.effects import added, on_outcomes
 
-DRAG = on_outcomes("drag", lambda x, phi, action, context: x - phi)
-NAMES = ["drag", "tilt", "bias"]
+DRAG = on_outcomes(
+    "drag",
+    lambda x, phi, action, context: x + phi * action * action.abs(),
+    family="dynamics",
+)
 SHUFFLED = [2.0, -1.0, 3.0, 1.0, -2.0, -3.0, 1.5, -1.5, 2.5]
+ACTIONS = DiscreteActions(torch.linspace(-3, 3, 13), names=["speed"], units=["m/s"])
+MODEL = SimulatorModel(
+    lambda theta, xi: (theta[:, :1] + theta[:, 1:] * xi).expand(-1, 6),
+    noise=GaussianNoise(0.1),
+)
 
 
-def evidence(name: str, log_evidence: float) -> results.Evidence:
-    rng = np.random.default_rng(0)
-    names = ("mu_1", "mu_2") if name == "none" else ("mu_1", "mu_2", name)
-    return results.Evidence(
-        key=results.ModelKey.of(name),
-        log_evidence=log_evidence,
-        standard_error=0.05,
-        effective_sample_size=312.0,
-        engine="least squares",
-        names=names,
-        draws=0.3 + 0.01 * rng.normal(size=(400, len(names))),
-    )
+def trials(action=SHUFFLED[:8], **more) -> Trials:
+    """Return six numbers a trial, with a drag of a tenth."""
+    action = torch.tensor(action)[:, None]
+    x = (0.3 + 0.5 * action + 0.1 * action * action.abs()).repeat(1, 6)
+    generator = torch.Generator().manual_seed(0)
+    return Trials(action, x + 0.1 * torch.randn(x.shape, generator=generator), **more)
 
 
-def estimate(name: str, probability: float, **changes) -> results.Estimate:
-    made = results.Estimate(
-        name=name,
-        family="dynamics",
-        units="1/m",
-        describe="a force against the speed" if name == "drag" else "",
-        probability=probability,
-        log_bayes_factor=9.4,
-        mean=np.array([0.123]),
-        sd=np.array([0.011]),
-        engine="least squares",
-    )
-    return replace(made, **changes)
+FITTED = trials()
+MADE = close_loop(
+    MODEL,
+    BoxUniform(-torch.ones(2), torch.ones(2)),
+    trials(SHUFFLED[:8] + [2.5, -2.5, 0.5, -0.5], role=["fit"] * 8 + ["held out"] * 4),
+    effects=[DRAG, added("tilt", torch.abs)],
+    actions=ACTIONS,
+)
+FOUND = {"warnings", "num_trials", "action_labels", "action_is_label", "channel_names"}
+PARTS = {f.name: getattr(MADE, f.name) for f in fields(MADE) if f.name not in FOUND}
 
 
 def tracing(verdict: str = "drag", **changes) -> results.Tracing:
-    probabilities = {"none": 0.004, "unexplained": 0.01, "scatter": 0.001}
-    probabilities |= {"drag": 0.81, "tilt": 0.125, "bias": 0.05}
-    chosen = (verdict,) if verdict in NAMES else ()
-    made = results.Tracing(
-        verdict=verdict,
-        chosen=chosen,
-        probabilities=probabilities,
-        inclusion={"drag": 0.81, "tilt": 0.125, "bias": 0.05},
-        credible_set=("drag", "tilt"),
-        equivalent=(),
-        estimates=tuple(estimate(n, probabilities[n]) for n in NAMES),
-        evidences={n: evidence(n, -3.0) for n in ["none", *NAMES, "unexplained"]},
-    )
-    return replace(made, **changes)
+    chosen = (verdict,) if verdict == "drag" else ()
+    return replace(MADE.tracing, **({"verdict": verdict, "chosen": chosen} | changes))
 
 
 def misfit(left_out, held_out=(None, None), *, sensor=(0.005,)) -> Misfit:
@@ -106,65 +92,5 @@ def residuals(
     )
 
 
-def evaluation(num: int = 8) -> results.Evaluation:
-    rng = np.random.default_rng(2)
-    before = {
-        "rmse": 0.05 + 0.02 * rng.random(num),
-        "energy score": 0.03 + 0.01 * rng.random(num),
-        "log predictive density": -20 - 5 * rng.random(num),
-        "coverage": np.round(rng.random(num) * 6) / 6,
-    }
-    after = {
-        "rmse": 0.2 * before["rmse"],
-        "energy score": 0.25 * before["energy score"],
-        "log predictive density": before["log predictive density"] + 35,
-        "coverage": np.full(num, 0.8),
-    }
-    table = pd.DataFrame({"metric": [*before], "ratio": [0.2, 0.25, 35.0, 0.3]})
-    for name, scores in (("before", before), ("after", after)):
-        table[name] = [own.mean() for own in scores.values()]
-    table = table.assign(low=0.9 * table["ratio"], high=1.1 * table["ratio"])
-    return results.Evaluation(
-        scheme="held out",
-        trials=np.arange(num, dtype=float),
-        before=before,
-        after=after,
-        table=table,
-    )
-
-
-def trials(action=SHUFFLED[:8]) -> Trials:
-    return Trials(torch.tensor(action), torch.randn(len(action), 6))
-
-
 def report(**changes):
-    noise = GaussianNoise(0.005)
-    parts = {
-        "trials": trials(),
-        "residuals": residuals(size=6.0),
-        "residuals_after": residuals(),
-        "detection": results.Detection(
-            log_bayes_factor=8.2,
-            threshold=float(np.log(20)),
-            chi_square=180.4,
-            degrees_of_freedom=46,
-            p_value=1e-16,
-            level=0.01,
-            null_log_evidence=-3.0,
-        ),
-        "tracing": tracing(),
-        "evaluation": evaluation(),
-        "next_action": results.NextAction(
-            action=np.array([3.0]),
-            candidates=np.array([[1.0], [3.0]]),
-            information_gain=np.array([0.1, 0.41]),
-            separates=("drag", "tilt"),
-        ),
-        "simulator": SimulatorModel(
-            lambda theta, action: theta[:, :1] * torch.ones(1, 6), noise=noise
-        ),
-        "prior": BoxUniform(torch.zeros(3), torch.ones(3)),
-        "actions": DiscreteActions([1.0, 3.0], names=["speed"], units=["m/s"]),
-        "digest": "0123456789abcdef",
-    }
-    return build_report(**(parts | changes))
+    return build_report(**({"trials": FITTED, "actions": ACTIONS} | PARTS | changes))

@@ -17,8 +17,8 @@ from sbi_active.criticism.contradictions import (
 )
 from tests.criticism.report.reports import (
     DRAG,
+    MADE,
     SHUFFLED,
-    evaluation,
     report,
     residuals,
     tracing,
@@ -26,13 +26,9 @@ from tests.criticism.report.reports import (
 )
 from tests.effects import BIAS, autocorrelated, on_outcomes
 
-SURE = report().detection
-HELD = evaluation()
-RIGHT = tracing()
-
 
 def noted(**changes):
-    return {"detection": replace(SURE, **changes)}
+    return {"detection": replace(MADE.detection, **changes)}
 
 
 def told(verdict="drag", **changes):
@@ -40,8 +36,8 @@ def told(verdict="drag", **changes):
 
 
 def with_evidence(**changes):
-    drag = replace(RIGHT.evidences["drag"], **changes)
-    return told(evidences=RIGHT.evidences | {"drag": drag})
+    drag = replace(MADE.tracing.evidences["drag"], **changes)
+    return told(evidences=MADE.tracing.evidences | {"drag": drag})
 
 
 def with_noise(kind):
@@ -72,7 +68,7 @@ def jumps(size):
 def pushed(mean, hook="observation"):
     """Return a report whose drag lies so many prior deviations from its null."""
     effect = replace(DRAG, hook=hook, family=hook)
-    evidence = RIGHT.evidences["drag"]
+    evidence = MADE.tracing.evidences["drag"]
     draws = evidence.draws.copy()
     draws[:, -1] += mean - draws[:, -1].mean()
     prior = joint_prior(BoxUniform(torch.zeros(2), torch.ones(2)), [effect])
@@ -80,9 +76,9 @@ def pushed(mean, hook="observation"):
 
 
 def errors(after):
-    table = HELD.table.copy()
+    table = MADE.evaluation.table.copy()
     table.loc[table["metric"] == "rmse", ["before", "after"]] = 1.0, after
-    return {"evaluation": replace(HELD, table=table)}
+    return {"evaluation": replace(MADE.evaluation, table=table)}
 
 
 def growing(rate):
@@ -134,7 +130,7 @@ CASES = {
         told(),
     ),
     "SA513": (told(set_aside=(ASIDE,)), told()),
-    "SA514": ({"evaluation": replace(HELD, missed=(MISSED,))}, {}),
+    "SA514": ({"evaluation": replace(MADE.evaluation, missed=(MISSED,))}, {}),
     "SA515": (pushed(3.0), pushed(2.0)),
     "SA516": (pushed(3.0), pushed(3.0, "dynamics")),
     "SA518": (told("unexplained"), told("scatter")),

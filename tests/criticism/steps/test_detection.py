@@ -31,7 +31,8 @@ def test_the_chi_square_alone_raises_the_alarm_where_the_noise_is_known():
 
 
 def test_the_chi_square_of_clean_data_is_one():
-    p = [detected(world.measured(seed=seed)).p_value for seed in range(24)]
+    bare = [world.rivals(world.measured(seed=k)).with_effects(()) for k in range(24)]
+    p = [world.judged(some).detection.p_value for some in bare]
     assert kstest(p, "uniform").pvalue > 0.01
 
 

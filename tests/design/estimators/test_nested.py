@@ -58,7 +58,7 @@ def test_six_numbers_that_four_parameters_make():
     assert not NestedGain().needs_slopes(rows)
     gain, error = estimate(rows, prior)
     exact, exact_error = OscillatorReference([], []).expected_information_gain(
-        model.ACTIONS[index], num_outer=200, num_inner=50_000
+        model.ACTIONS[index], num_outer=200, num_inner=20_000
     )
     error = (error**2 + exact_error**2).sqrt()
     assert ((gain - exact).abs() < 3 * error + 0.1).all()
@@ -109,7 +109,7 @@ def test_slopes_count_once_for_each_outcome():
 
 
 def test_noise_that_is_not_declared_is_learned():
-    rows, prior = oscillator(300, torch.tensor([6, 23]))
+    rows, prior = oscillator(200, torch.tensor([6, 23]))
     assert rows.mean is not None
     again = rows.noise.sample(rows.mean)
     pairs = CandidateSimulations(rows.theta, rows.action, rows.x, replicate=again)

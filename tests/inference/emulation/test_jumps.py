@@ -13,6 +13,7 @@ from sbi_active import (
     CampaignOptions,
     DiscreteActions,
     GaussianNoise,
+    RefinementOptions,
     SimulatorModel,
 )
 from sbi_active.inference.emulation.checks import _of_few
@@ -26,9 +27,10 @@ from sbi_active.inference.engine.learned import learned_fit
 from sbi_active.inference.sampling.coordinates import PriorCoordinates
 
 EDGE = -0.4
+FEW = RefinementOptions(num_histories=400, num_effective=50)
 
 
-def belief_of(response, seed):
+def belief_of(response, seed, num=300):
     """Return the belief of two trials, each a slope and a response beside it."""
 
     def fn(theta, xi):
@@ -36,7 +38,7 @@ def belief_of(response, seed):
 
     simulator = SimulatorModel(fn, noise=GaussianNoise(0.1))
     prior = BoxUniform(-torch.ones(2), torch.ones(2))
-    options = CampaignOptions(max_simulations=300, planned_trials=2)
+    options = CampaignOptions(max_simulations=num, planned_trials=2, refinement=FEW)
     given = {"options": options, "seed": seed}
     campaign = Campaign(simulator, prior, BoxActions([0.5], [1.5]), **given)
     truth = torch.tensor([[0.3, EDGE + 0.05]])
@@ -49,7 +51,7 @@ def belief_of(response, seed):
 @pytest.mark.parametrize("seed", [0, 1])
 def test_a_jump_is_followed_or_said_to_be_missed(seed):
     """Beyond the jump the second parameter changes nothing: it may be anywhere."""
-    belief = belief_of(lambda off: (off > 0).float(), seed)
+    belief = belief_of(lambda off: (off > 0).float(), seed, 160)
     middle, sd = 0.5 * (1 + EDGE), (1 - EDGE) / 12**0.5
     is_right = abs(float(belief.mean[1]) - middle) < 0.3 * sd
     assert is_right or not belief.diagnostics.trustworthy
@@ -109,7 +111,7 @@ def noisy(draw):
     ],
 )
 def test_few_simulations_tell_noise_that_is_not_normal(draw, holds):
-    options = CampaignOptions(max_simulations=500, planned_trials=3)
+    options = CampaignOptions(max_simulations=500, planned_trials=3, refinement=FEW)
     actions = DiscreteActions([1.0, 2.0])
     campaign = Campaign(noisy(draw), PRIOR, actions, seed=0, options=options)
     torch.manual_seed(0)

@@ -34,7 +34,7 @@ def simulator(theta, action):
 def round_of(inference):
     """Return a trainer after a round, small as it is."""
     torch.manual_seed(0)
-    theta, action = PRIOR.sample((400,)), torch.ones(400, 1)
+    theta, action = PRIOR.sample((200,)), torch.ones(200, 1)
     theta, action = inference.arrange(theta, action)
     inference.append_simulations(theta, simulator(theta, action), action=action)
     inference.train(max_num_epochs=2)
@@ -196,7 +196,7 @@ def test_without_actions_two_rounds_are_numerically_sbi_s(trainer, estimator):
         quiet = {"tracker": SilentTracker(), "show_progress_bars": False}
         inference, proposal = cls(PRIOR, *given, **quiet), PRIOR
         for index in range(2):
-            theta = proposal.sample((300,))
+            theta = proposal.sample((150,))
             x = theta + 0.1 * torch.randn_like(theta)
             told = {"proposal": proposal} if given else {"from_round": index}
             inference.append_simulations(theta, x, **told)

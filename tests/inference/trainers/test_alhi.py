@@ -95,7 +95,7 @@ def test_a_belief_is_a_normalized_distribution_that_pickles(posterior):
     x = theta * action + 0.1 * torch.randn(1_000, 1)
     inference.append_simulations(theta, x, action=action).train()
     belief = inference.update(torch.tensor([0.9]), action=torch.ones(1), seed=0)
-    grid = torch.linspace(-1, 1, 4_001)[:, None]
+    grid = torch.linspace(-1, 1, 1_001)[:, None]
     total = float(belief.log_prob(grid).exp().double().mean()) * 2
     # The normalizer rests on thousands of draws, .01 in its logarithm.
     assert total == pytest.approx(1, abs=0.05)
@@ -232,9 +232,9 @@ def test_seqbed_weighs_particles():
 
 
 def test_amortized_ratios_meet_the_closed_form():
-    classifier = RatioClassifier(hidden_features=(32,), num_iterations=150)
+    classifier = RatioClassifier(hidden_features=(32,), num_iterations=100)
     inference = SeqBED(PRIOR, classifier, show_progress_bars=False)
-    theta, x, action = rows(3_000)
+    theta, x, action = rows(2_000)
     inference.append_simulations(theta, x, action=action).train()
     model = inference.build_posterior()
     with torch.no_grad():

@@ -51,7 +51,7 @@ def test_the_posterior_meets_the_closed_form_at_every_action():
 
 
 def test_two_rounds_chain_to_the_exact_posterior():
-    settings = MixtureDensity(hidden_features=(32, 32), num_iterations=600)
+    settings = MixtureDensity(hidden_features=(32, 32), num_iterations=400)
     inference, belief = ASBI(PRIOR, settings, show_progress_bars=False), PRIOR
     for trial in TRIALS[:2]:
         theta = belief.sample((3_000,))
@@ -164,7 +164,9 @@ def test_truncated_proposals_of_the_belief_pass_and_others_do_not():
     inference = trained(QUICK, prior=BOX)
     packed = inference.build_posterior().packed()
     packed.set_default_x(torch.tensor([[0.0, 0.0, 1.0]]))
-    restricted = RestrictedPrior(BOX, get_density_thresholder(packed))
+    restricted = RestrictedPrior(
+        BOX, get_density_thresholder(packed, num_samples_to_estimate_support=10_000)
+    )
     inference.append_simulations(theta, x, proposal=restricted, action=action)
     with pytest.raises(ValueError, match="expected proposal to be the belief"):
         inference.append_simulations(theta, x, proposal=packed, action=action)

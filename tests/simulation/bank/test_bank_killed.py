@@ -15,7 +15,7 @@ from sbi_active.seeding import row_normals
 from sbi_active.simulation.workers.store import Recorder
 
 #: An outcome of 80 kB, so that writing takes most of the time.
-ROWS, BATCH, NUMBERS = 480, 16, 20_000
+ROWS, BATCH, NUMBERS = 240, 8, 20_000
 
 
 def simulator(theta, action, seeds):

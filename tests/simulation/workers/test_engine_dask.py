@@ -40,6 +40,9 @@ def client():
         distributed.Client(cluster) as client,
     ):
         yield client
+        for nanny in cluster.workers.values():  # who would ask it to end, and wait
+            nanny.auto_restart = False
+            os.kill(nanny.pid, signal.SIGKILL)
 
 
 @pytest.fixture
