@@ -153,7 +153,7 @@ def test_few_simulations_know_a_mean_that_is_wide_beside_its_noise():
     assert c.state.meter.spent <= 200
 
 
-@pytest.mark.parametrize("seed", [0, 3])
+@pytest.mark.parametrize("seed", [2, 5])
 def test_few_simulations_choose_an_action_that_tells_most(seed):
     """Rows of the prior, 10,000 deviations off, once hid what is near the belief."""
     task, sizes = get_task("numerical"), {"max_simulations": 800, "planned_trials": 4}
@@ -164,7 +164,7 @@ def test_few_simulations_choose_an_action_that_tells_most(seed):
     told = first.action[None], c.history[0].x[None]
     gain = task.reference(*told).expected_information_gain(task.actions.values)
     chosen = (task.actions.values == c.ask().action).all(1)
-    assert float(gain.max() - gain[chosen]) < 0.35  # before: .66 to 2.2
+    assert float(gain.max() - gain[chosen]) < 0.35  # before: 2.18 and 1.95
 
 
 def test_rows_lost_to_faults_are_counted_once():

@@ -171,8 +171,8 @@ def nearest_rows(
     """Return the rows that a process near a belief rests on, the nearest first.
 
     They are those inside the region. Rows far off make what is inside look as if it
-    were one place: with the rows nearest, however far, second actions of eight
-    campaigns of the numerical task lost .56 nat on average, and lose .06.
+    were one place: with the rows nearest, however far, second actions of twelve
+    campaigns of the numerical task lost .87 nat on average, and lose .09.
 
     Args:
         region: Region of the belief.
