@@ -39,6 +39,7 @@ from benchmarks.misfit.cases import draw_case
 from benchmarks.misfit.truth import Truth
 from benchmarks.rows import benchmark
 from sbi_active import DiscreteActions
+from sbi_active.actions.space import distance_from
 from sbi_active.criticism import Report, close_loop
 from sbi_active.criticism.experiments.settle import with_trial
 from sbi_active.display.table import Table
@@ -192,15 +193,11 @@ def spread_out(reality: Reality, num: int) -> Tensor:
         reality: Reality, whose trials were run already.
         num: Number of actions.
     """
-    values = reality.actions.values.double()
-    low, high = values.min(0).values, values.max(0).values
-    tried = reality.problem.trials.fit.action.double()
-    found: list[Tensor] = []
+    values, tried = reality.actions.values, [*reality.problem.trials.fit.action]
     for _ in range(num):
-        done = torch.cat([tried, *[a[None] for a in found]])
-        distance = torch.cdist(values / (high - low), done / (high - low))
-        found.append(values[distance.min(1).values.argmax()])
-    return torch.stack(found)
+        distance = distance_from(torch.stack(tried), values)
+        tried.append(values[int(distance.argmax())])
+    return torch.stack(tried[-num:])
 
 
 RESULTS = Path(__file__).parent / "results.jsonl"
@@ -221,7 +218,7 @@ def verdict_of(reality: Reality, number: int, design: str) -> Report:
     """
     problem = reality.problem
     options: dict[str, Any] = {"effects": problem.effects, "evaluate": False}
-    options |= {"seed": number, "actions": reality.actions}
+    options |= {"plan": False, "seed": number, "actions": reality.actions}
     given, trials = (problem.model, problem.prior), problem.trials
     if design == "chosen":
         run = {"real_system": reality.run, "max_trials": NUM_TRIALS}
@@ -235,7 +232,7 @@ def verdict_of(reality: Reality, number: int, design: str) -> Report:
     for action in actions:
         x = reality.run(action).numpy()
         trials = with_trial(problem.model, trials, action.double().numpy(), x)
-    return close_loop(*given, trials, plan=False, **options)
+    return close_loop(*given, trials, **options)
 
 
 def row_of(number: int, kind: Kind, design: str, reach: float) -> Row:
