@@ -1,6 +1,6 @@
 """What three chosen trials do to a verdict, beside random and spread-out ones.
 
-    python -m benchmarks experiments --cases 6000 6040
+    python -m benchmarks experiments --cases 6110 6122
     python -m benchmarks experiments --summary
 
 The machines, the effects and what nobody declared are those of the misfit benchmark, of
@@ -39,6 +39,7 @@ from benchmarks.misfit.cases import draw_case
 from benchmarks.misfit.truth import Truth
 from benchmarks.rows import benchmark
 from sbi_active import DiscreteActions
+from sbi_active.actions.space import distance_from
 from sbi_active.criticism import Report, close_loop
 from sbi_active.criticism.experiments.settle import with_trial
 from sbi_active.display.table import Table
@@ -192,15 +193,11 @@ def spread_out(reality: Reality, num: int) -> Tensor:
         reality: Reality, whose trials were run already.
         num: Number of actions.
     """
-    values = reality.actions.values.double()
-    low, high = values.min(0).values, values.max(0).values
-    tried = reality.problem.trials.fit.action.double()
-    found: list[Tensor] = []
+    values, tried = reality.actions.values, [*reality.problem.trials.fit.action]
     for _ in range(num):
-        done = torch.cat([tried, *[a[None] for a in found]])
-        distance = torch.cdist(values / (high - low), done / (high - low))
-        found.append(values[distance.min(1).values.argmax()])
-    return torch.stack(found)
+        distance = distance_from(torch.stack(tried), values)
+        tried.append(values[int(distance.argmax())])
+    return torch.stack(tried[-num:])
 
 
 RESULTS = Path(__file__).parent / "results.jsonl"
@@ -221,7 +218,7 @@ def verdict_of(reality: Reality, number: int, design: str) -> Report:
     """
     problem = reality.problem
     options: dict[str, Any] = {"effects": problem.effects, "evaluate": False}
-    options |= {"seed": number, "actions": reality.actions}
+    options |= {"plan": False, "seed": number, "actions": reality.actions}
     given, trials = (problem.model, problem.prior), problem.trials
     if design == "chosen":
         run = {"real_system": reality.run, "max_trials": NUM_TRIALS}
@@ -235,7 +232,7 @@ def verdict_of(reality: Reality, number: int, design: str) -> Report:
     for action in actions:
         x = reality.run(action).numpy()
         trials = with_trial(problem.model, trials, action.double().numpy(), x)
-    return close_loop(*given, trials, plan=False, **options)
+    return close_loop(*given, trials, **options)
 
 
 def row_of(number: int, kind: Kind, design: str, reach: float) -> Row:
@@ -261,28 +258,28 @@ def row_of(number: int, kind: Kind, design: str, reach: float) -> Row:
 
 
 def lines_of(rows: Sequence[Row]) -> str:
-    """Return the lines of the summary, of cases that have all designs."""
-    of: dict[tuple[Any, ...], dict[str, Row]] = {}
-    clean = [row for row in rows if row["kind"] == "C" and not row.get("failure")]
-    for row in rows:
-        key = (row["reach"], row["kind"], row["case"])
-        of.setdefault(key, {})[row["design"]] = row
-    whole = [c for c in of.values() if {*DESIGNS} <= {*c}]
-    failed = [r for c in whole for r in c.values() if r.get("failure")]
-    whole = [c for c in whole if not any(r.get("failure") for r in c.values())]
+    """Return the lines of the summary, each design over the cases that it has."""
+    failed = [row for row in rows if row.get("failure")]
     # NaN where it is not known: by construction these can be told.
-    whole = [c for c in whole if not c["chosen"].get("size", np.nan) <= SUPPORTED]
+    kept = [
+        r for r in rows if not (r.get("failure") or r.get("size", np.nan) <= SUPPORTED)
+    ]
+    clean = [row for row in kept if row["kind"] == "C"]
+    chosen = [row for row in kept if row["design"] == "chosen" and row["kind"] != "C"]
     cells = []
-    reaches = sorted({c["chosen"]["reach"] for c in whole})
+    reaches = sorted({row["reach"] for row in kept if row["kind"] != "C"})
     for reach, design in product(reaches, ("none", *DESIGNS)):
-        own = [c for c in whole if c["chosen"]["reach"] == reach]
-        own = [c[design] if design in c else _before(c["chosen"]) for c in own]
+        own = [row for row in kept if row["design"] == design]
+        own = [*map(_before, chosen)] if design == "none" else own
+        own = [row for row in own if row["reach"] == reach and row["kind"] != "C"]
+        if not own:
+            continue
         e, r, b, out = (
             [x for x in own if x["kind"] == k] for k in ("E", "R", "B", OUTSIDE)
         )
         large = [x for x in e if x["gain"] >= LARGE]
-        trials = sum(row["trials"] for row in own) / max(len(own), 1)
-        seconds = sum(row["cpu_seconds"] for row in own) / max(len(own), 1)
+        trials = sum(row["trials"] for row in own) / len(own)
+        seconds = sum(row["cpu_seconds"] for row in own) / len(own)
         shares = [rate([_is_right(row) for row in part]) for part in (large, e, b)]
         wrong = rate([not {*row["named"]} <= {*row["right"]} for row in e])
         alias = [rate([bool(row["named"]) for row in part]) for part in (r, out)]
@@ -292,9 +289,9 @@ def lines_of(rows: Sequence[Row]) -> str:
     names = "reach", "design", "E, gain >= 50 %: right", "E: right"
     names += "E: a wrong name", "R: an alias"
     names += "B: right", "B outside: an alias", "trials", "CPU s"
-    lines = [f"{len(whole)} cases with all designs; {len(failed)} rows failed", ""]
+    lines = [f"{len(kept)} rows; {len(failed)} failed", ""]
     lines += [Table(names, cells).markdown(), ""]
-    tested = [(t, c["chosen"]) for c in whole for t in c["chosen"]["tested"]]
+    tested = [(trial, row) for row in chosen for trial in row["tested"]]
     parts: dict[str, list[bool]] = {}
     for trial, row in tested:
         named = {*trial["before"].split(" + ")}
@@ -328,7 +325,7 @@ main = benchmark(
     lines_of,
     may_fail=True,
     skip=lambda case, kind, design, reach: kind == "C" and design != "chosen",
-    case=range(6_000, 6_040),
+    case=range(6_000, 6_122),
     kind=KINDS,
     design=DESIGNS,
     reach=(1.0, 1.5),

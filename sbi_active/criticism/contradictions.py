@@ -95,9 +95,9 @@ class SevereTest:
     Attributes:
         action: Action, shape (action_dim,).
         is_permitted: Whether it is among the permitted actions.
-        difference: Difference between the verdict's prediction and that of a free
-            residual, root mean square over the numbers of x, in standard deviations of
-            the verdict's prediction, noise included.
+        difference: Least difference between the verdict's prediction and that without
+            one of its effects, root mean square over the numbers of x, in standard
+            deviations of the verdict's prediction, noise included.
     """
 
     action: Array

@@ -48,8 +48,7 @@ def close_loop(  # noqa: D417  (the rest are those of Criticism)
 
     With ``real_system`` trials are run until they settle the verdict: each is chosen
     among ``actions`` to put the verdict to the test most, and predicted before it is
-    run. ``report.tested`` has them, and ``report.stopped`` why it ended. The plan
-    chooses them, and is made whatever ``plan`` says.
+    run. ``report.tested`` has them, and ``report.stopped`` why it ended.
 
     Args:
         real_system: Function that runs a trial: it takes an action, shape
@@ -73,8 +72,8 @@ def close_loop(  # noqa: D417  (the rest are those of Criticism)
             show_progress=show_progress,
         )
 
-    options: dict[str, Any] = {"evaluate": evaluate, "designed": designed}
+    options: dict[str, Any] = {"evaluate": evaluate, "plan": plan, "designed": designed}
     if real_system is None:
-        return compare(trials).report(plan=plan, **options)
+        return compare(trials).report(**options)
     options |= {"max_trials": max_trials, "directory": directory}
     return settle(compare, trials, real_system, **options)

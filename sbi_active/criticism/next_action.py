@@ -4,12 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from sbi_active.actions import ActionSpace, DiscreteActions
+from sbi_active.actions.space import distance_from
 from sbi_active.arrays import Array
 from sbi_active.criticism.contradictions import SevereTest
 from sbi_active.criticism.data.trials import Trials
@@ -37,7 +40,7 @@ class PlanSettings:
         something: Information of another action that is worth a second choice, nats.
         samples: Outcomes of a candidate and rival, half to choose and half to report.
             Of a half, three quarters fit a density, which needs some tens.
-        max_tests: Candidates of a severe test, and as many beyond the range.
+        max_tests: Candidates of a severe test beyond the permitted range.
         num_draws: Draws of each prediction in a severe test.
         max_entries: Covariances of the residual process in a severe test.
     """
@@ -57,6 +60,8 @@ class PlanSettings:
 
 
 PLAN = PlanSettings()
+#: Distance, in ranges of the actions, below which two are the same.
+SAME = 1e-6
 
 
 def permitted_candidates(rivals: RivalSet, actions: ActionSpace) -> Tensor:
@@ -315,26 +320,30 @@ class _Choosing:
 
 
 def severe_tests(
-    rivals: RivalSet, tracing: Tracing, actions: ActionSpace
+    rivals: RivalSet, tracing: Tracing, actions: ActionSpace, *, outside: bool = True
 ) -> tuple[SevereTest, ...]:
     r"""Return the permitted action that tests a named verdict most, and one beyond.
 
     A verdict may be the alias of an effect that was not declared: it explains the
-    trials at hand about as well, with other parameters. The rival without a cause is a
-    free residual, the bare model and the residual process as fitted to the trials.
-    Where it expects an outcome far from the verdict's prediction, the verdict stands or
-    falls by the trial:
+    trials at hand about as well, with other parameters. Each of its effects stands or
+    falls by a trial where the model without it expects an outcome far from the
+    verdict's prediction,
 
     .. math::
-        d^2 = \frac{1}{N} \sum_i \frac{(\mu_i - \mu^r_i)^2 + (s^r_i)^2}{s_i^2} - 1
+        d^2 = \min_e \frac{1}{N} \sum_i \frac{(\mu_i - \mu^e_i)^2}{s_i^2},
 
     with means and standard deviations, noise included, of the verdict's prediction of
-    the N numbers of x and, with r, of the residual's.
+    the N numbers of x, and those without an effect e. That without any is a free
+    residual, the bare model and the residual process as fitted to the trials. Where a
+    trial was, a fit predicts whatever is right: other actions come first. How sure the
+    others are does not count: where every model misses they are all as unsure
+    everywhere, and what the trials tell best would look like the severest test.
 
     Args:
         rivals: The models.
         tracing: The verdict; one that names no effect has none.
         actions: The permitted ones.
+        outside: Whether to look beyond these.
 
     References:
         Mayo, Error and the Growth of Experimental Knowledge (1996), on severe tests.
@@ -345,32 +354,35 @@ def severe_tests(
     m = rivals.measurements
     # As many as the residual process predicts in memory.
     most = max(PLAN.max_entries // (len(m) * int(np.prod(m.shape[1:]))), 2)
-    few = min(PLAN.max_tests, most)
+    few = min(PLAN.max_tests, most) * outside
     farther = simulated(rivals, beyond_range(actions, candidates, limit=few))
-    each = ((spread_out(candidates, few), True), (farther, False))
-    return tuple(
-        _most_severe(rivals, tracing, some, is_permitted=is_permitted)
-        for some, is_permitted in each
-        if len(some)
-    )
+    inside = _most_severe(rivals, tracing, spread_out(candidates, most))
+    beyond = [_most_severe(rivals, tracing, farther, False)] if len(farther) else []
+    return (inside, *beyond)
 
 
 def _most_severe(
-    rivals: RivalSet, tracing: Tracing, candidates: Tensor, *, is_permitted: bool
+    rivals: RivalSet, tracing: Tracing, candidates: Tensor, is_permitted: bool = True
 ) -> SevereTest:
-    trials = following(rivals, candidates)
-    # Where every model has a residual process, the bare model has one too.
-    residual = ModelKey(error=None if tracing.misfit else UNEXPLAINED)
-    options = {"num_draws": PLAN.num_draws, "scored": False}
-    verdict = predict(rivals, trials, key=tracing.key, **options)
-    free = predict(rivals, trials, key=residual, **options)
-    (_, sd), (_, spread) = verdict.moments(), free.moments()
-    square = ((free.middle - verdict.middle) ** 2 + spread**2) / sd**2
-    trial, num = verdict.measurements.trial, len(candidates)
-    size = np.maximum(np.bincount(trial, minlength=num), 1)
-    total = np.bincount(trial, square, minlength=num)
-    difference = np.sqrt(np.maximum(total / size - 1, 0.0))
-    best = int(np.argmax(difference))
+    options: dict[str, Any] = {"num_draws": PLAN.num_draws, "scored": False}
+    predicted = partial(predict, rivals, following(rivals, candidates), **options)
+    verdict = predicted(key=tracing.key)
+    sd, trial = verdict.moments()[1], verdict.measurements.trial
+    size = np.maximum(np.bincount(trial, minlength=len(candidates)), 1)
+
+    def difference_without(name: str) -> Array:
+        rest = tracing.key.without(name)
+        if not rest.effects:
+            # Where every model has a residual process, the bare model has one too.
+            rest = ModelKey(error=None if tracing.misfit else UNEXPLAINED)
+        square = ((verdict.middle - predicted(key=rest).middle) / sd) ** 2
+        return np.sqrt(np.bincount(trial, square, minlength=len(candidates)) / size)
+
+    # What helps beside a named cause is not what is to be tested.
+    names = (tracing.misfit and tracing.misfit.named) or tracing.chosen
+    difference = np.min([difference_without(name) for name in names], axis=0)
+    tried = distance_from(rivals.trials.action, candidates).numpy() < SAME
+    best = int(np.argmax(np.where(tried & ~tried.all(), -1.0, difference)))
     return SevereTest(
         action=candidates[best].double().numpy(),
         is_permitted=is_permitted,

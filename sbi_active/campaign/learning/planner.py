@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from sbi_active.actions import ActionSpace, DiscreteActions
+from sbi_active.actions.space import distance_from
 from sbi_active.campaign.learning.learner import Learner
 from sbi_active.campaign.learning.methods import find_method
 from sbi_active.campaign.learning.pooled import PooledLearner
@@ -317,10 +318,7 @@ def most_unlike(actions: ActionSpace, executed: Sequence[Tensor]) -> ActionSpace
     if not executed:
         return actions
     values = _listed_or_drawn(actions)
-    width = values.max(0).values - values.min(0).values
-    width = torch.where(width > 0, width, torch.ones_like(width))
-    places = torch.stack([*executed])
-    distance = torch.cdist(values / width, places / width).min(1).values
+    distance = distance_from(torch.stack([*executed]), values)
     best = distance >= distance.max() - 1e-6
     return DiscreteActions(values[best], names=actions.names, units=actions.units)
 

@@ -2,22 +2,34 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import takewhile
+from typing import Any
 
 import numpy as np
 import torch
 from scipy import stats
 from scipy.optimize import brentq
-from scipy.spatial.distance import cdist
 from scipy.special import gammaln
 
+from sbi_active.actions.space import distance_from
 from sbi_active.criticism.criticism import Criticism
-from sbi_active.criticism.next_action import following
-from sbi_active.criticism.report.contents import Registered, TestedTrial
+from sbi_active.criticism.next_action import (
+    SAME,
+    following,
+    permitted_candidates,
+    severe_tests,
+)
+from sbi_active.criticism.report.contents import Registered
 from sbi_active.criticism.report.report import Report
-from sbi_active.criticism.results import NONE, UNEXPLAINED, Array, ModelKey
+from sbi_active.criticism.results import (
+    CATCH_ALLS,
+    NONE,
+    UNEXPLAINED,
+    Array,
+    ModelKey,
+)
 from sbi_active.criticism.steps.predictive import predict
 from sbi_active.expected import suggests
 from sbi_active.inference.sampling.weights import normalized
@@ -40,13 +52,16 @@ class Settling:
             settled.
         clean: Probability of "none" from which it may be: that before any trial. With
             .9 one clean simulator of eight was tested two or three times for nothing.
+        tests: Trials that a verdict that names effects has to predict: of the aliases
+            of tuning seeds that fall by a trial some predict one, and one two.
         tells: Information about which model is right that is worth a trial, nats.
-        differs: Difference between the verdict's prediction and that of a free residual
-            that is worth a trial, in standard deviations of the former.
+        differs: Difference between the verdict's prediction and that without one of its
+            effects that is worth a trial, in standard deviations of the former.
     """
 
     probability: float = 0.9
     clean: float = 0.5
+    tests: int = 3
     tells: float = 0.1
     differs: float = 1.0
 
@@ -64,74 +79,60 @@ class Choice:
     purpose: str
 
 
-def choose(
-    report: Report, tested: Sequence[TestedTrial], settling: Settling
-) -> Choice | None:
+def choose(criticism: Criticism, report: Report, settling: Settling) -> Choice | None:
     """Return the permitted action that puts a verdict to the test most.
 
-    A verdict that names effects is first tested against a free residual, which stands
-    for what nobody declared: an alias fits the trials so far, and errs where another
-    action tells it from its cause. Once such a test was run, rivals among the declared
-    models are told apart. If nothing explains the trials, models cannot say where to
-    look: it is where the residual is least known, farthest from all trials.
+    A verdict that names effects is tested where it matters most that they are there: an
+    alias fits the trials so far, and errs where another action tells it from its cause.
+    Where none is named, or no action tests them, rivals among the declared models are
+    told apart. If nothing explains the trials, models cannot say where to look: it is
+    where the residual is least known, farthest from all trials.
 
     Args:
-        report: Report with its plan.
-        tested: Trials that were run before.
+        criticism: The models, fitted to the trials so far.
+        report: Report with their verdict.
         settling: Least that a trial has to tell.
 
     Returns:
         None if no permitted action tells enough.
     """
-    plan, told, test = report.next_action, None, None
-    purpose = f"tests {report.tracing.model}"
-    if plan is not None and np.max(plan.information_gain) >= settling.tells:
-        between = f"tells {', '.join(plan.separates)} apart"
-        told = None if plan.action is None else Choice(plan.action, between)
-    for severe in report.severe_tests[:1]:  # the permitted one
-        if severe.is_permitted and severe.difference >= settling.differs:
-            test = Choice(severe.action, purpose)
-    is_new = all(trial.registered.purpose != purpose for trial in tested)
-    chosen = (test or told) if is_new else (told or test)
-    if chosen is None and report.verdict == UNEXPLAINED:
-        return _untried(report)
-    return chosen
+    rivals, actions = criticism.rivals, criticism.actions
+    assert actions is not None
+    is_named = report.verdict not in (NONE, *CATCH_ALLS)
 
+    def told() -> Choice | None:
+        plan = criticism.next_action(beyond=False)
+        if plan.action is None or np.max(plan.information_gain) < settling.tells:
+            return None
+        return Choice(plan.action, f"tells {', '.join(plan.separates)} apart")
 
-def _untried(
-    report: Report,
-    *,
-    # Distance, in widths of the permitted actions, below which two are the same.
-    same: float = 1e-6,
-) -> Choice | None:
-    """Return the permitted action that is farthest from all that were tried."""
-    if report.next_action is None or report.action_is_label:
+    def test() -> Choice | None:
+        tests = severe_tests(rivals, report.tracing, actions, outside=False)
+        severe = [t.action for t in tests if t.difference >= settling.differs]
+        return Choice(severe[0], f"tests {report.tracing.model}") if severe else None
+
+    chosen = (test() or told()) if is_named else (told() or test())
+    if chosen or report.verdict != UNEXPLAINED or report.action_is_label:
+        return chosen
+    candidates = permitted_candidates(rivals, actions)
+    distance = distance_from(rivals.trials.action, candidates)
+    if distance.max() < SAME:
         return None
-    candidates, tried = report.next_action.candidates, report.residuals.action
-    width = np.ptp(candidates, axis=0)
-    width = np.where(width > 0, width, 1.0)
-    distance = cdist(candidates / width, tried / width).min(1)
-    best = int(np.argmax(distance))
-    if distance[best] < same:
-        return None
-    return Choice(candidates[best], "shows the residual where no trial was")
+    action = candidates[int(distance.argmax())].double().numpy()
+    return Choice(action, "shows the residual where no trial was")
 
 
-def failures(
-    report: Report, tested: Sequence[TestedTrial], *, surprising: float = 0.05
-) -> list[str]:
+def failures(report: Report, *, surprising: float = 0.05) -> list[str]:
     """Return a warning if a verdict stands though its predictions failed.
 
     As many failures have a probability below .05 if the intervals hold in .9.
 
     Args:
-        report: Report with the verdict.
-        tested: Trials that were run.
+        report: Report with the verdict, and the trials that tested it.
         surprising: Probability of as many failed predictions below which they
             are a warning.
     """
-    own = [t for t in tested if t.registered.verdict == report.verdict]
-    own = [t for t in own if t.is_measured]
+    own = [t for t in report.measured if t.registered.verdict == report.verdict]
     failed = [f"{t.registered.index:g}" for t in own if not t.held]
     if stats.binom.sf(len(failed) - 1, len(own), 1 - COVERAGE) >= surprising:
         return []
@@ -139,27 +140,23 @@ def failures(
     return [f"{told} of {len(own)} that tested it, and is the verdict still"]
 
 
-def unless_unproven(report: Report, tested: Sequence[TestedTrial]) -> Report:
-    """Return a report that names the effects alone whose predictions held.
+def unless_unproven(report: Report, remaining: float) -> Report:
+    """Return a report that names the effects alone that trials proved.
 
     Where every model misses, whatever fits the last trial best is an explanation in
-    hindsight. An effect is named if models that had it, as causes or beside them, were
-    right at least as often as wrong about the trials that tested them, and once; else
-    it helps, and is not named. Of three predictions of a cause two or more fail with a
-    probability of .03.
+    hindsight. An effect is named by what it leaves of the error of fits, and is
+    withdrawn by what it leaves of the error of predictions. One that no trial tested
+    helps, and is not named.
 
     Args:
-        report: Report with the verdict on all trials.
-        tested: Trials that were run.
+        report: Report with the verdict on all trials, and those that tested it.
+        remaining: Share of the squared error that an effect may leave
+            (:class:`.Rule`).
     """
     tracing, misfit = report.tracing, report.tracing.misfit
-    told = [trial for trial in tested if trial.is_measured]
-    if misfit is None or not told:
+    if misfit is None or not report.measured:
         return report
-    held = {
-        n: [t.held for t in told if n in t.registered.effects] for n in misfit.named
-    }
-    named = tuple(n for n, own in held.items() if 2 * sum(own) >= max(len(own), 1))
+    named = tuple(n for n in misfit.named if report.left_by(n) <= remaining)
     if named == misfit.named:
         return report
     new = str(ModelKey(tuple(n for n in misfit.named if n not in named)))
@@ -174,22 +171,19 @@ def unless_unproven(report: Report, tested: Sequence[TestedTrial]) -> Report:
     return replace(report, tracing=tracing, warnings=warnings)
 
 
-def is_settled(
-    report: Report, tested: Sequence[TestedTrial], settling: Settling
-) -> bool:
+def is_settled(report: Report, settling: Settling, enough: int = 1) -> bool:
     """Return whether a verdict is probable, and predicted what tested it.
 
     Args:
-        report: Report with the verdict.
-        tested: Trials that were run. Those since the verdict was reached have to agree
-            with its predictions, and there has to be one.
+        report: Report with the verdict, and the trials that were run. Those since it
+            was reached have to agree with its predictions, and there has to be one.
         settling: Probabilities that a verdict has to have.
+        enough: Number of these that has to be there where effects are named.
     """
-    own = [*takewhile(lambda t: t.registered.verdict == report.verdict, tested[::-1])]
-    told = [trial for trial in own if trial.is_measured]
-    held = bool(told) and all(trial.held for trial in told)
-    is_clean = report.verdict == NONE
+    verdict, is_clean = report.verdict, report.verdict == NONE
+    own = [*takewhile(lambda t: t.registered.verdict == verdict, report.measured[::-1])]
     needed = settling.clean if is_clean else settling.probability
+    held = len(own) >= (1 if is_clean else enough) and all(trial.held for trial in own)
     return held and probability_of(report) >= needed
 
 
@@ -215,15 +209,13 @@ def register(
     trial = following(rivals, torch.from_numpy(choice.action)[None])
     trial.index = torch.full_like(trial.index, index)
     seed = derive_seed(rivals.seed, "registered", len(rivals.trials))
-    options = {"num_draws": num_draws, "seed": seed, "scored": False}
-    prediction = predict(rivals, trial, key=report.tracing.key, **options)
-    bare = prediction
-    if report.tracing.key != ModelKey():
-        bare = predict(rivals, trial, **options)
+    options: dict[str, Any] = {"num_draws": num_draws, "seed": seed, "scored": False}
+    predicted, key = partial(predict, rivals, trial, **options), report.tracing.key
+    prediction = predicted(key=key)
     mean, sd = prediction.moments()
     distance = np.sqrt((((prediction.x - mean) / sd) ** 2).mean(1))
     limit = float(np.quantile(distance, COVERAGE))
-    spread = rivals.fit(report.tracing.key).spread
+    spread = rivals.fit(key).spread
     if spread is not None:
         mean = prediction.middle
         limit = limit_of(spread.square, len(mean)) / spread.scale
@@ -236,8 +228,7 @@ def register(
         sd=sd,
         position=prediction.measurements.position,
         limit=limit,
-        bare=bare.middle,
-        effects=report.tracing.key.effects,
+        without={n: predicted(key=key.without(n)).middle for n in key.effects},
     )
 
 

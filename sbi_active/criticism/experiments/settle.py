@@ -33,8 +33,6 @@ from sbi_active.expected import require
 from sbi_active.messages import Explained, Message
 from sbi_active.simulation import SimulatorModel
 
-SETTLED = "settled"
-
 
 class VerdictError(Explained, RuntimeError):
     """The verdict failed after trials were run, which are kept.
@@ -59,6 +57,7 @@ def settle(
     max_trials: int,
     directory: str | Path | None = None,
     evaluate: bool = True,
+    plan: bool = True,
     designed: bool = False,
     settling: Settling = Settling(),  # noqa: B008  (frozen)
 ) -> Report:
@@ -77,6 +76,7 @@ def settle(
         directory: Folder that keeps predictions and measurements, from which a loop
             that was interrupted goes on; None keeps them in the report alone.
         evaluate: Whether the report has the error before and after.
+        plan: Whether the report has the action to take next.
         designed: Whether the trials' actions were chosen for their information.
         settling: When a verdict is settled.
 
@@ -95,34 +95,32 @@ def settle(
         trials = with_trial(first.model, trials, trial.registered.action, trial.x)
     scored = evaluate and bool(trials.held_out_positions)
     while True:
-        options = {"evaluate": scored, "designed": designed or bool(tested)}
-        criticism, report = _verdict(compare, trials, options, first, tested)
-        if tested:
-            tested[-1] = replace(tested[-1], after=report.verdict)
-            said = {"verdict": report.verdict, "held": tested[-1].held}
-            journal.write("judged", index=tested[-1].registered.index, **said)
-        stopped = SETTLED * is_settled(report, tested, settling)
-        choice = None if stopped else choose(report, tested, settling)
-        if choice is None:
-            stopped = stopped or "no permitted action tells more"
-        elif len(tested) >= max_trials:
-            stopped = "no trials are left"
+        criticism, report = _verdict(compare, trials, first, tested, evaluate=scored)
+        is_last = len(tested) >= max_trials
+        choice = None if is_last else choose(criticism, report, settling)
+        enough = 1 if choice is None else settling.tests
+        stopped = "settled" * is_settled(report, settling, enough)
         if choice is None or stopped:
+            why = "no trials are left" if is_last else "no permitted action tells more"
+            stopped = stopped or why
             break
         registered = register(criticism, report, choice, _next_index(trials))
         journal.write("registered", **vars(registered))
         action = torch.from_numpy(choice.action).float()
         x = np.array(torch.as_tensor(real_system(action)), dtype=float)
         journal.write("measured", index=registered.index, x=x)
-        tested.append(TestedTrial(registered=registered, x=x, after=""))
+        tested.append(TestedTrial(registered=registered, x=x))
         trials = with_trial(first.model, trials, choice.action, x)
-    if evaluate and not scored:
-        report = criticism.report(designed=designed or bool(tested))
-        if stopped == SETTLED and not is_settled(report, tested, settling):
-            stopped = "left-out trials speak against the verdict"
-    report = unless_unproven(report, tested)
-    warnings = (*report.warnings, *map(Message, failures(report, tested)))
-    return replace(report, tested=(*tested,), stopped=stopped, warnings=warnings)
+    options = {"evaluate": evaluate, "plan": plan}
+    report = criticism.report(designed=designed or bool(tested), **options)
+    report = replace(report, tested=(*tested,))
+    report = unless_unproven(report, criticism.rule.remaining)
+    if stopped == "settled" and not is_settled(report, settling):
+        stopped = "trials that had no part in it speak against the verdict"
+    verdicts = [*[t.registered.verdict for t in tested], report.verdict]
+    after = (*[replace(t, after=v) for t, v in zip(tested, verdicts[1:], strict=True)],)
+    warnings = (*report.warnings, *map(Message, failures(report)))
+    return replace(report, tested=after, stopped=stopped, warnings=warnings)
 
 
 def with_trial(
@@ -156,28 +154,30 @@ def _next_index(trials: Trials) -> float:
 def _verdict(
     compare: Callable[[Trials], Criticism],
     trials: Trials,
-    options: dict[str, bool],
     first: Criticism,
     tested: list[TestedTrial],
+    *,
+    evaluate: bool,
 ) -> tuple[Criticism, Report]:
-    if not tested:
-        return first, first.report(**options)
     try:
-        criticism = compare(trials)
-        return criticism, criticism.report(**options)
+        criticism = compare(trials) if tested else first
+        report = criticism.report(evaluate=evaluate, plan=False)
     except Exception as error:
+        if not tested:
+            raise
         raise VerdictError(
             f"expected a verdict on {len(trials)} trials; got {error}; go on from the "
             "directory, or from .trials of this error",
             trials,
         ) from error
+    return criticism, replace(report, tested=(*tested,))
 
 
 NAME = "trials.jsonl"
 
 
 class Journal:
-    """A file of events, one a line: begun, registered, measured, judged.
+    """A file of events, one a line: begun, registered, measured.
 
     Args:
         directory: Folder of the file; None keeps nothing.
@@ -230,7 +230,6 @@ class Journal:
             TestedTrial(
                 registered=_registered(parts["registered"]),
                 x=np.asarray(parts["measured"]["x"], dtype=float),
-                after=parts.get("judged", {}).get("verdict", ""),
             )
             for parts in of.values()
             if "measured" in parts
@@ -239,9 +238,9 @@ class Journal:
 
 def _registered(event: dict[str, Any]) -> Registered:
     own = {f.name: event[f.name] for f in fields(Registered) if f.name in event}
-    effects = tuple(own.pop("effects", ()))
     arrays = {k: np.asarray(v) for k, v in own.items() if isinstance(v, list)}
-    return Registered(**{**own, **arrays}, effects=effects)
+    without = {k: np.asarray(v) for k, v in own.pop("without", {}).items()}
+    return Registered(**{**own, **arrays}, without=without)
 
 
 def _read(path: Path) -> list[dict[str, Any]]:

@@ -111,6 +111,7 @@ def _recorded(found: Verdict) -> list[ModelKey]:
         return [
             *_shown(found),
             found.choice.key,
+            *found.choice.key.parts,  # which trials may prove each effect against
             ModelKey(),
             *singles,
             *_weights(found),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -47,8 +47,8 @@ class Registered:
         position: Positions of these numbers in the flattened x, shape (N,).
         limit: Distance within which an outcome lies with a probability of .9, root mean
             square over x in ``sd``.
-        bare: Numbers that the bare model predicts, shape (N,), in units of x.
-        effects: Effects of the model that predicts, named by the verdict or not.
+        without: Numbers that the same model predicts without each of its effects, by
+            name, named by the verdict or not.
     """
 
     index: float
@@ -59,18 +59,7 @@ class Registered:
     sd: Array
     position: Array
     limit: float
-    bare: Array
-    effects: tuple[str, ...] = ()
-
-    def distance(self, x: Array) -> float:
-        """Return the distance of an outcome; NaN if nothing was measured.
-
-        Args:
-            x: Measured numbers, of the shape of x.
-        """
-        z = (np.ravel(x)[self.position] - self.mean) / self.sd
-        seen = np.isfinite(z)
-        return float(np.sqrt(np.mean(z[seen] ** 2))) if seen.any() else float("nan")
+    without: dict[str, Array] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -85,14 +74,18 @@ class TestedTrial:
 
     registered: Registered
     x: Array
-    after: str
+    after: str = ""
 
     __test__ = False  # no test of pytest's
 
     @property
     def distance(self) -> float:
         """Distance of the outcome from the prediction, in its standard deviations."""
-        return self.registered.distance(self.x)
+        return self.off(self.registered.mean, self.registered.sd)
+
+    def distance_without(self, name: str) -> float:
+        """Return the distance from what is predicted without an effect."""
+        return self.off(self.registered.without[name], self.registered.sd)
 
     @property
     def is_measured(self) -> bool:
@@ -113,17 +106,23 @@ class TestedTrial:
             predicted = f"{own.mean[0] - half:.4g} to {own.mean[0] + half:.4g}"
         if not self.is_measured:
             return predicted, "nothing"
-        measured = f"{self._off(own.mean):.3g} off"
+        measured = f"{self.off(own.mean):.3g} off"
         if is_one:
             measured = f"{np.ravel(self.x)[own.position][0]:.4g}"
-        if not np.array_equal(own.mean, own.bare):
-            measured += f" (bare model: {self._off(own.bare):.3g} off)"
+        for name, mean in own.without.items():
+            measured += f" (without {name}: {self.off(mean):.3g} off)"
         return predicted, measured
 
-    def _off(self, predicted: Array) -> float:
-        """Return the root mean square by which a prediction missed, units of x."""
-        x = np.ravel(self.x)[self.registered.position]
-        return float(np.sqrt(np.nanmean((x - predicted) ** 2)))
+    def off(self, predicted: Array, unit: Array | float = 1.0) -> float:
+        """Return the root mean square by which a prediction missed; NaN for none.
+
+        Args:
+            predicted: Numbers that were predicted, shape (N,).
+            unit: Unit of each, in that of x.
+        """
+        error = (np.ravel(self.x)[self.registered.position] - predicted) / unit
+        error = error[np.isfinite(error)]
+        return float(np.sqrt(np.mean(error**2))) if len(error) else float("nan")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -202,6 +201,24 @@ class Contents:
     def equivalent(self) -> tuple[frozenset[str], ...]:
         """Groups of names that no permitted action separates."""
         return self.tracing.equivalent
+
+    @property
+    def measured(self) -> list[TestedTrial]:
+        """Tested trials that gave a number that was predicted, in order."""
+        return [trial for trial in self.tested if trial.is_measured]
+
+    def left_by(self, name: str) -> float:
+        """Return the share of the squared error that an effect left of predictions.
+
+        They are those of models that had it, in their standard deviations, and those of
+        the same models without it; NaN if no trial tested it.
+
+        Args:
+            name: Name of the effect.
+        """
+        own = [t for t in self.measured if name in t.registered.without]
+        left = sum(t.distance**2 for t in own)
+        return left / sum(t.distance_without(name) ** 2 for t in own) if own else np.nan
 
     @property
     def guess(self) -> str | None:

@@ -16,6 +16,7 @@ from sbi_active.criticism.experiments.choice import (
     unless_unproven,
 )
 from sbi_active.criticism.experiments.settle import NAME, VerdictError, settle
+from sbi_active.criticism.misfit.rule import Rule
 from tests.criticism.misfit import oscillator
 from tests.effects import added
 
@@ -116,10 +117,11 @@ def test_a_registered_prediction_is_that_of_linear_least_squares():
     assert own.limit == pytest.approx(1.645, abs=0.3)  # 4 errors of a quantile of 400
     alone = FORWARD.double()
     bare = float(own.action[0]) * float((alone * trials.x).sum() / (alone**2).sum())
-    assert own.bare[0] == pytest.approx(bare, abs=0.02)
+    assert own.without["drag"][0] == pytest.approx(bare, abs=0.02)
 
 
-def test_no_effect_is_named_whose_predictions_did_not_hold():
+def test_an_effect_is_withdrawn_by_the_rule_that_named_it():
+    """By what it leaves of the error of predictions, in place of that of fits."""
     action = torch.linspace(0.5, 2.0, 9, dtype=torch.float64)[:, None]
     every = oscillator.trials(action=action, lag=0.3, hidden=0.6)
     report = close_loop(
@@ -131,17 +133,27 @@ def test_no_effect_is_named_whose_predictions_did_not_hold():
         evaluate=False,
     )
     (trial,) = report.tested
-    assert report.tracing.misfit.named == trial.registered.effects == ("lag",)
+    own, remaining = trial.registered, Rule().remaining
+    assert report.tracing.misfit.named == (*own.without,) == ("lag",)
     assert trial.held
     # As wide as errors on left-out trials, which t of few trials widens.
-    own, left_out = trial.registered, report.tracing.misfit.of("lag").left_out[0]
+    left_out = report.tracing.misfit.of("lag").left_out[0]
     assert left_out < own.limit * own.sd.mean() < 3 * left_out
-    assert unless_unproven(report, [trial]) is report
-    failed = replace(trial, registered=replace(trial.registered, limit=0.0))
-    assert unless_unproven(report, [failed, trial]) is report
-    assert unless_unproven(report, [failed, trial, failed]).verdict == "unexplained"
-    others = replace(trial, registered=replace(trial.registered, effects=()))
-    found = unless_unproven(report, [others])
+
+    def off(share):
+        """Return a trial in which the effect leaves a share of the squared error."""
+        new = replace(own, without={"lag": own.mean + own.sd * (1 + share**-0.5)})
+        return replace(trial, registered=new, x=own.mean + own.sd)
+
+    def after(*tested):
+        return unless_unproven(replace(report, tested=tested), remaining)
+
+    assert off(0.2).held
+    for tested in ([trial], [off(0.9 * remaining)], [off(0.2), off(0.3)]):
+        assert after(*tested).verdict == "lag"
+    for tested in ([off(1.1 * remaining)], [off(0.2), off(0.4)]):
+        assert after(*tested).verdict == "unexplained"
+    found = after(replace(trial, registered=replace(own, without={})))
     assert (found.verdict, found.tracing.beside) == ("unexplained", ("lag",))
     assert found.tracing.key == report.tracing.key  # it still predicts
     assert probability_of(found) == 0.0
@@ -188,7 +200,7 @@ def test_a_measurement_is_kept_though_the_verdict_fails(tmp_path):
         file.write('{"event": "judged", "ind')  # cut off by a crash
     report = settle(comparing(), trials, robot, **options)
     assert report.verdict == "drag"
-    assert len(robot.asked) == len(report.tested) < 3  # none was run twice
+    assert len(robot.asked) == len(report.tested) == 3  # none was run twice
     again = settle(comparing(), trials, robot, **options)
     assert len(robot.asked) == len(again.tested) == len(report.tested)
     with pytest.raises(ValueError, match="another directory"):
