@@ -93,6 +93,12 @@ class Search:
         """Effects that change the prediction, of which sets are fitted."""
         return [e.name for e in self.rivals.effects.values() if e.hook != "noise"]
 
+    @property
+    def heavy(self) -> tuple[float, Array] | None:
+        """Degrees of freedom and deviation of t errors; None where errors are none."""
+        df = self.sensor.cells[0].df
+        return (df, self.unit) if np.isfinite(df) else None
+
     @cached_property
     def library(self) -> Library:
         """The bare model with the columns of all effects."""
@@ -288,12 +294,10 @@ class Search:
     def rival(self, key: ModelKey) -> Rival:
         """Return a model that may be fitted."""
         if key not in self._rivals:
-            is_random, df = self.rivals.simulator.is_stochastic, self.sensor.cells[0].df
-            self._rivals[key] = self.rivals.rival(
-                key,
-                reference=self.unit if is_random else None,
-                heavy=(df, self.unit) if np.isfinite(df) else None,
-            )
+            is_random = self.rivals.simulator.is_stochastic
+            reference = self.unit if is_random else None
+            given = {"reference": reference, "heavy": self.heavy}
+            self._rivals[key] = self.rivals.rival(key, **given)
         return self._rivals[key]
 
     def _fit(self, key: ModelKey, parents: Sequence[ModelKey]) -> LinearModel:

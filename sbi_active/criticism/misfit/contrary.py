@@ -208,16 +208,17 @@ def beyond_bounds(found: Verdict, rivals: RivalSet, tracing: Tracing) -> Tracing
     sides = {key: _sides(rivals.fits[known]) for key, known in keys.items()}
     if not any(side.any() for side in sides.values()):
         return _unless_none(tracing, Bounds())
+    heavy = found.search.heavy
     (last, u), rival = [*fits.items()][-1], rivals.rival(own)
     whiten = rivals.noise.whitener(rival.residual(u[None])[0][0])  # errors may last
-    best = _refitted(rivals, rivals.rival(last), whiten, [u])
+    best = _refitted(rivals, rivals.rival(last, heavy=heavy), whiten, [u])
     assert best is not None
     square, bounds, dim = best[1], Bounds(), rival.theta_dim
     spare = max(rival.num_observed - rival.dim, 1)
     for key, side in sides.items():
         if not side.any():
             continue
-        rival, point = _moved(rivals.rival(key), side), fits[key]
+        rival, point = _moved(rivals.rival(key, heavy=heavy), side), fits[key]
         starts = [point, np.r_[u[:dim], point[dim:]]]
         again = _refitted(rivals, rival, whiten, starts)
         held = _held(rivals, side, rival, again)

@@ -5,6 +5,7 @@ import pytest
 import torch
 from scipy.special import logsumexp
 from scipy.stats import norm, t
+from torch.distributions import Independent, Uniform
 
 from sbi_active import SimulatorModel, StudentTNoise
 from sbi_active.criticism import Criticism, Trials
@@ -30,6 +31,7 @@ from tests.criticism.linear.test_any_simulator import (
     XI,
     curve,
     measured,
+    shifted,
 )
 from tests.criticism.misfit import oscillator
 
@@ -133,6 +135,22 @@ def test_squares_of_signed_deviances_are_what_log_densities_lose():
     assert from_deviance(found, DF) == pytest.approx(errors)
     slope = (signed_deviance(errors + 1e-4, DF) - found)[1:] / 1e-4
     assert deviance_slope(errors, DF)[1:] == pytest.approx(slope, rel=1e-3)
+
+
+@pytest.mark.parametrize("far", [0.0, 30.0])
+def test_a_narrow_prior_is_seen_beside_a_trial_far_off(far):
+    narrow = torch.tensor([0.5, 2.0]).double()
+    slope = shifted("slope", torch.sin)
+    x = measured(seed=2)
+    x[4] += far * SD
+    model = SimulatorModel(curve, noise=StudentTNoise(SD, DF))
+    prior = Independent(Uniform(-narrow, narrow), 1)
+    loop = Criticism(model, prior, Trials(ACTION, x), effects=[slope, *EFFECTS[1:]])
+    assert loop.trace().verdict == "slope"
+    bounds = loop.judged(None).bounds
+    assert bounds is not None
+    assert bounds.replaces == "slope"
+    assert bounds.parameters[0].beyond == pytest.approx(0.7, abs=0.15)
 
 
 def test_a_trial_in_other_units_is_an_outlier_beside_heavy_tails():
