@@ -304,16 +304,16 @@ class Errors:
             gained = np.bincount(self.fold, own.offset - model.offset)
             return replace(found, log_det=found.log_det - 2 * gained)
 
-        def posterior(own: LinearModel) -> Mixture:
+        def total(own: LinearModel) -> tuple[Array, Array]:
             found = grams(own)
-            return summed(found.gram.sum(1), self.constants(found), own)
+            return found.gram.sum(1), self.constants(found)
 
         def left(own: LinearModel, found: Mixture) -> Array:
             chosen = np.full(m.channel.max() + 1, np.argmax(found.share))
             rest = own.at(found.mean[None]).T
             return whitened(rest, self.processes, m, chosen, self.fold)[:, 0]
 
-        return grams(beside_process(model, posterior, left, df))
+        return grams(beside_process(model, total, left, df))
 
     def _one_trial(
         self, model: LinearModel, grams: Grams, use: NDArray[np.bool_]

@@ -66,7 +66,7 @@ def summed(gram: Array, log_weight: Array, model: LinearModel) -> Mixture:
 
 def beside_process(
     model: LinearModel,
-    posterior: Callable[[LinearModel], Mixture],
+    grams: Callable[[LinearModel], tuple[Array, Array]],
     left: Callable[[LinearModel, Mixture], Array],
     df: float,
     *,
@@ -79,17 +79,17 @@ def beside_process(
 
     Args:
         model: Linear model, which they touch without a process.
-        posterior: Function that gives the posterior beside the process.
+        grams: Function that gives Gram matrices beside each process, and log weights.
         left: Function from a model and its posterior to what the likeliest process
             leaves of its residuals, shape (N,).
         df: Degrees of freedom.
         rounds: Number of times that they are moved.
     """
-    best, largest, own = model, posterior(model).log_evidence, model
+    best, largest = model, summed(*grams(model), model).log_evidence
     error = np.zeros(model.num)  # all of it is the process's
     for _ in range(rounds):
         own = touching(model, error, df)
-        found = posterior(own)
+        found = summed(*grams(own), own)
         if found.log_evidence > largest:
             best, largest = own, found.log_evidence
         error = left(own, found) / own.weight

@@ -29,7 +29,7 @@ from sbi_active.criticism.linear.fits import (
 )
 from sbi_active.criticism.linear.left_out import Candidate, leave_out
 from sbi_active.criticism.linear.library import Library
-from sbi_active.criticism.linear.mixture import Mixture, beside_process, summed
+from sbi_active.criticism.linear.mixture import Mixture, beside_process
 from sbi_active.criticism.linear.model import (
     LinearModel,
     at_null,
@@ -208,11 +208,8 @@ class Search:
             rest[own] = joint.left(wide * rest[own]) / wide
             return rest
 
-        def posterior(at: LinearModel) -> Mixture:
-            return summed(*grams(at), at)
-
         df = self.sensor.cells[0].df
-        return grams(beside_process(model, posterior, left, df))
+        return grams(beside_process(model, grams, left, df))
 
     @property
     def explains(self) -> bool:
