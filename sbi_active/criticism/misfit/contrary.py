@@ -115,8 +115,7 @@ def _told(evaluation: Evaluation) -> NDArray[np.bool_]:
 def _rmse(evaluation: Evaluation, told: NDArray[np.bool_]) -> tuple[float, float]:
     """Return the error before and after, over some of the scored trials."""
     if told.all():
-        rmse = evaluation.table.set_index("metric").to_dict("index")["rmse"]
-        return rmse["before"], rmse["after"]
+        return evaluation.rmse
     before, after = (
         float(np.sqrt(np.mean(scores["rmse"][told] ** 2)))
         for scores in (evaluation.before, evaluation.after)
@@ -163,10 +162,8 @@ def judged(
     effects = {e.name: e for e in rivals.library}
     if not any(is_force(effects[name]) for name in tracing.chosen):
         return tracing
-    if evaluation is not None:
-        rmse = evaluation.table.set_index("metric").to_dict("index")["rmse"]
-        if rmse["ratio"] >= 1:
-            return replace(withdrawn(tracing), refuted=(rmse["before"], rmse["after"]))
+    if evaluation is not None and evaluation.rmse[1] >= evaluation.rmse[0]:
+        return replace(withdrawn(tracing), refuted=evaluation.rmse)
     return replace(tracing, stand_in=(*_reasons(rivals, tracing, evaluation),))
 
 
