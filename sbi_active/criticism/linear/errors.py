@@ -282,8 +282,7 @@ class Errors:
         """
         if not self.is_heavy:
             return factors, np.log(factors)
-        error = model.residual[: model.num] / model.weight
-        weight, peak = tangent(error / factors, self.cells[0].df)
+        weight, peak = tangent(model.errors / factors, self.cells[0].df)
         return factors * model.weight / weight, np.log(factors) - peak + model.peak
 
     def _beside(self, model: LinearModel) -> Grams:

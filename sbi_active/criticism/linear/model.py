@@ -83,6 +83,11 @@ class LinearModel:
         return np.concatenate([self.residual[:, None], -self.jacobian], 1)
 
     @property
+    def errors(self) -> Array:
+        """Residuals in deviations of the error, however far out, shape (N,)."""
+        return self.residual[: self.num] / self.weight
+
+    @property
     def rms(self) -> float:
         """Root mean square of the residual, in standard deviations of the sensor."""
         return float(np.sqrt(np.mean(self.residual[: self.num] ** 2)))

@@ -82,7 +82,7 @@ class Search:
             self.rivals.measurements,
             self.unit,
             self.sensor,
-            largest=bare.rms,
+            largest=float(np.sqrt(np.mean(bare.errors**2))),
             warm_up=self.rivals.warm_up if self.rivals.nuisances else 0.0,
             varying=bare.jacobian[: bare.num, bare.trial_of < 0],
         )

@@ -90,7 +90,7 @@ def test_a_strong_effect_is_not_overstated_where_least_squares_ends_elsewhere():
     assert linear == pytest.approx(gained(x), abs=1.5)
 
 
-@pytest.mark.parametrize("wider", [1.0, 10.0])
+@pytest.mark.parametrize("wider", [1.0, 10.0, 300.0])
 def test_larger_errors_have_tails_as_heavy(wider):
     error = t(DF, scale=np.sqrt((DF - 2) / DF)).rvs(12, random_state=0)
     theta = torch.tensor([[0.7, -0.4]]).double()
