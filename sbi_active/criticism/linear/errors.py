@@ -291,12 +291,13 @@ class Errors:
         if not self.is_heavy:
             return self.filters.grams(model.rows[: len(m)])
         if not m.is_sequence:  # a process is a larger error
-            size = np.repeat(np.hypot(1, self.sizes)[:, None], len(m), 1)
-            parts = np.eye(self.num_folds, dtype=bool)
-            each = [self.scaled(model, size, own) for own in parts]
-            log_p = np.stack([log_p for _, log_p in each], 1) + np.log(len(size))
-            gram = np.stack([gram for gram, _ in each], 1)
-            return Grams(gram, -2 * log_p - count * LOG_2PI, count)
+            size, cell = np.hypot(1, self.sizes)[:, None], self.cells[0]
+            factors, log_size = self._sized(model, np.repeat(size, len(m), 1))
+            white = cell.whiten(model.rows.T / factors[:, None])
+            parts = [white[..., self.fold == j] for j in range(self.num_folds)]
+            gram = np.stack([own @ np.swapaxes(own, 1, 2) for own in parts], 1)
+            logs = [np.bincount(self.fold, own + cell.log_scales) for own in log_size]
+            return Grams(gram, 2 * np.array(logs), count)
 
         def grams(own: LinearModel) -> Grams:
             found = self.filters.grams(own.rows)
