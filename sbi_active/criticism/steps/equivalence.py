@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
-from copy import copy
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -18,12 +16,12 @@ from sbi_active.criticism.data.trials import Trials
 from sbi_active.criticism.effects.effect import Effect
 from sbi_active.criticism.effects.trial_conditions import unmeasured
 from sbi_active.criticism.forces.library import is_force
-from sbi_active.criticism.results import NONE, ModelKey
-from sbi_active.criticism.rivals.error_models import NoiseCell, NoiseGrid
-from sbi_active.criticism.rivals.rival import Rival
+from sbi_active.criticism.results import NONE
+from sbi_active.criticism.rivals.coordinates import SearchCoordinates
+from sbi_active.criticism.rivals.error_models import declared_noise
 from sbi_active.criticism.rivals.rival_set import RivalSet
 from sbi_active.criticism.rivals.trial_simulator import TrialSimulator
-from sbi_active.inference.sampling.least_squares import basis_of, descend
+from sbi_active.inference.sampling.least_squares import basis_of
 from sbi_active.seeding import derive_seed, forked_generators
 
 #: Effects of a library whose pairs are all compared, and that are all fitted.
@@ -117,54 +115,41 @@ class _World:
             rivals.simulator.model, trials, seed=derive_seed(rivals.seed, "equivalence")
         )
         self.prior, self.is_smooth = rivals.prior, rivals.is_smooth
-        m = self.simulator.measurements
-        self.unit = np.full(len(m), np.median(rivals.spread))  # what counts as large
-        if rivals.model.noise is not None:
-            self.unit = rivals.noise_of(m).typical_sd
+        self.unit = np.median(rivals.spread)  # what counts as large
+        if (noise := rivals.model.noise) is not None:
+            own = declared_noise(noise, self.simulator.measurements)
+            self.unit = own.typical_sd
         self.step = max(rivals.step, 1e-4)  # from the null, in deviations of the prior
-        self.bare = self.rival(())
-        self.coordinates = self.bare.coordinates
+        self.coordinates = SearchCoordinates(self.prior, (), (), len(trials))
 
-    def rival(self, effects: Sequence[Effect], aim: Array | float = 0.0) -> Rival:
-        """Return the simulator with effects, any parameters of which are as likely.
-
-        Args:
-            effects: Effects that it has.
-            aim: Numbers that it is to predict, in noise units, shape (N,).
-        """
-        simulator, m = copy(self.simulator), self.simulator.measurements
-        simulator.measurements = replace(m, x=self.unit * aim)
-        rival = Rival(
-            key=ModelKey(tuple(e.name for e in effects)),
-            simulator=simulator,
-            prior=self.prior,
-            effects=effects,
-            nuisances=(),
-            error=NoiseGrid([NoiseCell.of(m, sd=self.unit)]),
-            spread=self.unit,
-            center=np.zeros(len(m)),
-            step=self.step,
-        )
-        rival.coordinates.precision = np.zeros(rival.dim)
-        return rival
-
-    def predict(self, u: Array, effect: Effect | None = None, phi: Any = 0) -> Array:
-        """Return the prediction at parameters u, shape (d,), beside an effect."""
-        theta, own = self.coordinates.split(u[None])
+    def predict(
+        self, c: SearchCoordinates, u: Array, effect: Effect | None = None, phi: Any = 0
+    ) -> Array:
+        """Return predictions at u, shape (n, d), beside an effect that u has not."""
+        theta, own = c.split(u)
         if effect is not None:
             own[effect.name] = phi
-        return self.simulator.predict(theta, own)[0][0] / self.unit
+        return self.simulator.predict(theta, own)[0] / self.unit
+
+    def slopes(self, c: SearchCoordinates, u: Array) -> tuple[Array, Array]:
+        """Return predictions at u, shape (N,), and their derivatives, (N, d)."""
+        sign = np.where(u + self.step > c.high, -1.0, 1.0)
+        mean = self.predict(c, np.concatenate([u[None], u + self.step * np.diag(sign)]))
+        return mean[0], ((mean[1:] - mean[0]) / self.step * sign[:, None]).T
 
     def left_over(
         self, u: Array, effects: Sequence[Effect]
     ) -> list[tuple[Array, float]]:
         """Return each effect's direction that no parameter imitates, and its size."""
-        mean = np.nan_to_num(self.predict(u), posinf=0.0, neginf=0.0)
-        slopes = self.bare.jacobian(u[None], self.bare.whitener(), self.step)[1][0]
-        basis, left = basis_of(slopes), []
+        mean, jacobian = (
+            np.where(np.isfinite(part), part, 0.0)
+            for part in self.slopes(self.coordinates, u)
+        )
+        basis = basis_of(jacobian)
+        left = []
         for effect in effects:
             shift, scale = _small(effect, self.step)
-            moved = self.predict(u, effect, shift)
+            moved = self.predict(self.coordinates, u[None], effect, shift)[0]
             change = (np.where(np.isfinite(moved), moved, 0.0) - mean) / scale
             rest = change - basis @ (basis.T @ change)
             left.append((rest, float(np.linalg.norm(change))))
@@ -178,46 +163,61 @@ class _World:
             other: Effect that is imitated.
             u: Parameters beside it, shape (d,).
         """
+        c, start = self.coordinates, u
         own = () if one is None else (one,)
+        if own:
+            c = SearchCoordinates(self.prior, own, (), len(self.simulator))
         for far in FAR:
             shift, scale = _small(other, far)
             begin = [_small(effect, far)[0] for effect in own]
             each = zip((other, *own), (shift, *begin), strict=True)
             if not all(bool(e.log_prob(phi).isfinite().all()) for e, phi in each):
                 continue
-            aim, bare = self.predict(u, other, shift), self.predict(u)
+            if own:
+                z = [self.coordinates.to_z(u[None]), *(phi.numpy() for phi in begin)]
+                start = c.from_z(np.concatenate(z, 1))[0]
+            aim = self.predict(self.coordinates, u[None], other, shift)[0]
+            bare = self.predict(self.coordinates, u[None])[0]
             both = np.isfinite(aim) & np.isfinite(bare)
             whole = float(np.linalg.norm((aim - bare)[both])) / scale
-            z = [self.coordinates.to_z(u[None]), *(phi.numpy() for phi in begin)]
-            rival = self.rival(own, np.where(both, aim, 0.0))
-            rest, is_free = self._rest(rival, np.concatenate(z, 1), both)
+            rest, is_free, has_ended = self._rest(c, start, aim, both)
             left = float(np.linalg.norm(rest)) / scale
             nothing = left**2 < SAME and left < RELATIVE * whole
-            if whole > 0 and is_free and not nothing:
+            if whole > 0 and is_free and not nothing and (has_ended or not own):
                 return False
         return True
 
     def _rest(
-        self, rival: Rival, z: Array, both: NDArray[np.bool_]
-    ) -> tuple[Array, bool]:
-        """Return the rest of predictions that parameters leave, from some on.
+        self, c: SearchCoordinates, u: Array, aim: Array, both: NDArray[np.bool_]
+    ) -> tuple[Array, bool, bool]:
+        """Return the rest of predictions that parameters leave, by Gauss-Newton steps.
 
         It also returns whether they were free, since at an edge of the prior the edge
-        may be what stands against them.
+        may be what stands against them; and whether the search has ended, so that no
+        step promises more.
         """
-        c = rival.coordinates
-
-        def whiten(residual: Array) -> Array:
-            return np.where(both, residual / self.unit, 0.0)
-
-        u = c.from_z(z)
-        if not self.is_smooth:  # a search would find the jumps: to first order
-            rest, slope = rival.jacobian(u, whiten, self.step)
-            basis = basis_of(slope[0])
-            return rest[0] - basis @ (basis.T @ rest[0]), True
-        u, _ = descend(rival, u, whiten, self.step, 30, converged=1e-6)
-        rest = whiten(rival.residual(u)[0])[0]
-        return rest, bool(((u > c.low) & (u < c.high)).all())
+        rest, has_ended = (aim - self.predict(c, u[None])[0])[both], False
+        # Where the simulator jumps, a search for parameters finds the jumps.
+        for _ in range(6):
+            slope = self.slopes(c, u)[1][both]
+            slope = np.where(np.isfinite(slope), slope, 0.0)
+            move = np.linalg.lstsq(slope, rest, rcond=1e-9)[0]
+            if not self.is_smooth:  # to first order
+                return rest - slope @ move, True, True
+            size = np.linalg.norm(rest)
+            for share in (1.0, 0.5, 0.25, 0.125):
+                to = np.clip(u + share * move, c.low, c.high)
+                after = (aim - self.predict(c, to[None])[0])[both]
+                if np.linalg.norm(after) < size:
+                    u, rest = to, after
+                    has_ended = bool(np.linalg.norm(after) > 0.99 * size)
+                    break
+            else:
+                has_ended = bool(np.linalg.norm(rest - slope @ move) > 0.5 * size)
+                break
+            if np.linalg.norm(rest) < 1e-4:  # noise units
+                break
+        return rest, bool(((u > c.low) & (u < c.high)).all()), has_ended
 
 
 def _small(effect: Effect, step: float) -> tuple[torch.Tensor, float]:
