@@ -36,7 +36,7 @@ def support_of(distribution: Distribution) -> Any:
         base = support_of(distribution.base_dist)
         return constraints.independent(base, distribution.reinterpreted_batch_ndims)
     if isinstance(distribution, MultipleIndependent):
-        parts = [_number(support_of(part)) for part in distribution.dists]
+        parts = [elementwise(support_of(part)) for part in distribution.dists]
         sizes = [int(size) for size in distribution.dims_per_dist]
         return constraints.independent(constraints.cat(parts, -1, sizes), 1)
     if isinstance(distribution, VonMises):
@@ -83,8 +83,8 @@ def support_bounds(support: Any, dim: int) -> tuple[Array, Array]:
     return bounds[0], bounds[1]
 
 
-def _number(support: Any) -> Any:
-    """Return the constraint of one number of a vector, which torch can concatenate."""
+def elementwise(support: Any) -> Any:
+    """Return a constraint on single numbers, if it is one, which torch can join."""
     while support.event_dim > 0 and hasattr(support, "base_constraint"):
         support = support.base_constraint
     return support

@@ -335,6 +335,12 @@ class Evaluation:
     p_value: float = float("nan")
     missed: tuple[MissedTrial, ...] = ()
 
+    @property
+    def rmse(self) -> tuple[float, float]:
+        """Root mean square error before and after, over all scored trials."""
+        row = self.table.set_index("metric").loc["rmse"]
+        return float(row["before"]), float(row["after"])
+
 
 @dataclass(frozen=True, kw_only=True)
 class NextAction:

@@ -188,7 +188,7 @@ def at_times(x: Tensor, wanted: Tensor, times: Tensor) -> Tensor:
 
     Args:
         x: Samples, as in :func:`lagged_samples`.
-        wanted: Times that are wanted, shape (n, k).
+        wanted: Times that are wanted, shape (n, m).
         times: Sample times, as in :func:`lagged_samples`.
     """
     times, wanted = times.contiguous(), wanted.contiguous()
@@ -199,7 +199,8 @@ def at_times(x: Tensor, wanted: Tensor, times: Tensor) -> Tensor:
     gap = gap.where(gap > 0, torch.ones_like(gap))
     weight = (wanted - times.gather(1, low)) / gap
     shape = (*low.shape, *[1] * (x.ndim - 2))
-    index, weight = low.reshape(shape).expand_as(x), weight.reshape(shape)
+    index = low.reshape(shape).expand(*low.shape, *x.shape[2:])
+    weight = weight.reshape(shape)
     return (1 - weight) * x.gather(1, index) + weight * x.gather(1, index + 1)
 
 

@@ -16,7 +16,7 @@ from sbi_active.criticism.effects.effect import (
     require_distinct,
 )
 from sbi_active.expected import require
-from sbi_active.support import support_of
+from sbi_active.support import elementwise, support_of
 
 
 class JointPrior(Distribution):
@@ -104,8 +104,7 @@ def joint_prior(prior: Distribution, effects: Sequence[Effect]) -> JointPrior:
 
 def _elementwise(support: Any) -> constraints.Constraint:
     """Return a constraint on single numbers, which torch can concatenate."""
-    while support.event_dim > 0 and hasattr(support, "base_constraint"):
-        support = support.base_constraint
+    support = elementwise(support)
     require(
         support.event_dim == 0,
         "priors whose numbers are bounded one by one",

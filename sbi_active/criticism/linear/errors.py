@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 
 from sbi_active.arrays import Array
 from sbi_active.criticism.data.measurements import Measurements
-from sbi_active.criticism.linear.mixture import Mixture, summed
+from sbi_active.criticism.linear.mixture import Mixture, beside_process, summed
 from sbi_active.criticism.linear.model import LinearModel
 from sbi_active.criticism.linear.processes import (
     Filters,
@@ -36,9 +36,11 @@ from sbi_active.criticism.linear.processes import (
     Processes,
     parts_of,
     time_scales,
+    whitened,
 )
 from sbi_active.criticism.results import OUTLIER, UNEXPLAINED
 from sbi_active.criticism.rivals.error_models import LARGEST, LOG_2PI, NoiseGrid, sizes
+from sbi_active.criticism.rivals.heavy_tails import tangent
 from sbi_active.criticism.steps.predictive import is_first_part
 from sbi_active.inference.sampling.weights import log_sum_exp
 
@@ -111,6 +113,11 @@ class Errors:
         self.varying = varying / np.where(size > 0, size, 1.0)
 
     @property
+    def is_heavy(self) -> bool:
+        """Whether errors of the sensor have the tails of Student's t."""
+        return bool(np.isfinite(self.cells[0].df))
+
+    @property
     def num_processes(self) -> int:
         """Errors with a process: kernels, time scales and sizes."""
         return len(self.processes)
@@ -127,13 +134,10 @@ class Errors:
         each = [np.full(n, -np.log(n)) for n in counts if n]
         return np.concatenate(each) - np.log(len(each))
 
-    def grams(self, rows: Array) -> Grams:
-        """Return the Gram matrices of rows (N, k), the sensor's errors first.
-
-        Of 2 N rows the last are what no error changes.
-        """
-        k, f, size = rows.shape[1], self.num_folds, len(self.measurements)
-        every, rows = rows, rows[:size]
+    def grams(self, model: LinearModel) -> Grams:
+        """Return the Gram matrices of a model's rows, the sensor's errors first."""
+        every, f, size = model.rows, self.num_folds, len(self.measurements)
+        k, rows = every.shape[1], every[:size]
         n, num = len(self.log_sensor), len(self.log_sensor) + len(self.log_prior)
         count = np.bincount(self.fold, minlength=f)
         gram, log_det = np.zeros((num, f, k, k)), np.zeros((num, f))
@@ -146,7 +150,7 @@ class Errors:
                 own = white[self.fold == j]
                 gram[at, j] = own.T @ own / self.scales[:, None, None] ** 2
         at = n + self.num_processes
-        process = self.filters.grams(rows)
+        process = self._beside(model)
         gram[n:at], log_det[n:at] = process.gram, process.log_det
         for j in range(f) if self.varying.size else ():
             own = rows[self.fold == j]
@@ -223,6 +227,9 @@ class Errors:
         log_p = self.log_sensor + constants[own]
         if state is None:
             return gram, log_p
+        if self.is_heavy:
+            size = np.hypot(1, self.sizes)[:, None]
+            return self.scaled(model, np.repeat(size, len(self.fold), 1), use)
         size, extra = np.sqrt(1 + self.sizes**2), self.unchanged(model.rows, use)
         log_p = log_p - grams.count[use].sum() * np.log(size)[:, None]
         gram = (gram - extra) / size[:, None, None, None] ** 2 + extra
@@ -243,27 +250,70 @@ class Errors:
         return -0.5 * (log_det + grams.count[use].sum() * LOG_2PI)
 
     def scaled(
-        self, rows: Array, factors: Array, use: NDArray[np.bool_]
+        self, model: LinearModel, factors: Array, use: NDArray[np.bool_]
     ) -> tuple[Array, Array]:
-        """Return Gram matrices of rows under other sizes of the sensor's error.
+        """Return Gram matrices of a model under other sizes of the sensor's error.
 
         Args:
-            rows: Rows, shape (N, k).
-            factors: Factors on the size of each number's error, shape (s, N).
+            model: Linear model.
+            factors: Factors on the size of each number's error, equally likely, shape
+                (s, N).
             use: Parts of the trials that count, shape (f,).
 
         Returns:
             Gram matrices, shape (c j s, k, k), and log weights, shape (c j s,).
         """
         grams, log_weight, own = [], [], use[self.fold]
-        extra, rows = self.unchanged(rows, use), rows[: len(own)]
+        extra, rows = self.unchanged(model.rows, use), model.rows[: len(own)]
+        factors, log_size = self._sized(model, factors)
         each = product(self.cells, self.scales)
         for (cell, size), log_p in zip(each, self.log_sensor, strict=True):
             white = cell.whiten(rows.T / (size * factors[:, None]))[..., own]
             grams.append(white @ np.swapaxes(white, 1, 2) + extra)
-            log_det = (np.log(size * factors) + cell.log_scales)[:, own].sum(1)
+            log_det = (np.log(size) + log_size + cell.log_scales)[:, own].sum(1)
             log_weight.append(log_p - log_det - 0.5 * own.sum() * LOG_2PI)
-        return np.concatenate(grams), np.concatenate(log_weight)
+        return np.concatenate(grams), np.concatenate(log_weight) - np.log(len(factors))
+
+    def _sized(self, model: LinearModel, factors: Array) -> tuple[Array, Array]:
+        """Return factors (s, N) on residuals under errors of other sizes, and logs.
+
+        T errors of another size are touched by another Gaussian: where they are larger,
+        no residual is as far out.
+        """
+        if not self.is_heavy:
+            return factors, np.log(factors)
+        weight, peak = tangent(model.errors / factors, self.cells[0].df)
+        return factors * model.weight / weight, np.log(factors) - peak + model.peak
+
+    def _beside(self, model: LinearModel) -> Grams:
+        """Return the Gram matrices of a model's rows beside each process."""
+        m, df, count = self.measurements, self.cells[0].df, np.bincount(self.fold)
+        if not self.is_heavy:
+            return self.filters.grams(model.rows[: len(m)])
+        if not m.is_sequence:  # a process is a larger error
+            size, cell = np.hypot(1, self.sizes)[:, None], self.cells[0]
+            factors, log_size = self._sized(model, np.repeat(size, len(m), 1))
+            white = cell.whiten(model.rows.T / factors[:, None])
+            parts = [white[..., self.fold == j] for j in range(self.num_folds)]
+            gram = np.stack([own @ np.swapaxes(own, 1, 2) for own in parts], 1)
+            logs = [np.bincount(self.fold, own + cell.log_scales) for own in log_size]
+            return Grams(gram, 2 * np.array(logs), count)
+
+        def grams(own: LinearModel) -> Grams:
+            found = self.filters.grams(own.rows)
+            gained = np.bincount(self.fold, own.offset - model.offset)
+            return replace(found, log_det=found.log_det - 2 * gained)
+
+        def total(own: LinearModel) -> tuple[Array, Array]:
+            found = grams(own)
+            return found.gram.sum(1), self.constants(found)
+
+        def left(own: LinearModel, found: Mixture) -> Array:
+            chosen = np.full(m.channel.max() + 1, np.argmax(found.share))
+            rest = own.at(found.mean[None]).T
+            return whitened(rest, self.processes, m, chosen, self.fold)[:, 0]
+
+        return grams(beside_process(model, total, left, df))
 
     def _one_trial(
         self, model: LinearModel, grams: Grams, use: NDArray[np.bool_]
@@ -281,6 +331,8 @@ class Errors:
         Returns:
             Gram matrices, shape (t h, k, k), trial by trial, and log weights, (t h,).
         """
+        if self.is_heavy:
+            return self._one_larger(model, use)
         n, found, weights = len(self.log_sensor), [], []
         shape = len(self.kernels), len(self.times), len(self.sizes)
         places = n + np.arange(self.num_processes).reshape(shape)
@@ -296,6 +348,18 @@ class Errors:
             weights.append(-0.5 * (log_det + grams.count[use].sum() * LOG_2PI))
         weight = np.concatenate(weights)
         return np.concatenate(found), weight - np.log(len(weight))
+
+    def _one_larger(
+        self, model: LinearModel, use: NDArray[np.bool_]
+    ) -> tuple[Array, Array]:
+        """Return what :meth:`_one_trial` returns, with larger errors in the trial."""
+        found, weights, size = [], [], np.hypot(1, self.spreads)[:, None]
+        for trial in self.trials:
+            factors = np.where(trial[self.fold], size, 1.0)
+            gram, log_p = self.scaled(model, factors, use)
+            found.append(gram)
+            weights.append(log_p - np.log(len(self.trials)))
+        return np.concatenate(found), np.concatenate(weights)
 
     @cached_property
     def trials(self) -> list[NDArray[np.bool_]]:

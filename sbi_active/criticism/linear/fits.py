@@ -12,6 +12,7 @@ import numpy as np
 
 from sbi_active.arrays import Array
 from sbi_active.criticism.linear.model import LinearModel, centered, linearize
+from sbi_active.criticism.rivals.heavy_tails import deviance_slope, from_deviance
 from sbi_active.criticism.rivals.rival import Rival
 from sbi_active.inference.sampling.least_squares import descend
 
@@ -69,6 +70,19 @@ class FitSettings:
 JUMPING = FitSettings(num_drawn=12)
 
 
+def missed_by(rival: Rival, rms: float) -> float:
+    """Return the size of errors in a search, in deviations of the sensor.
+
+    Where a model misses, all of its residual counts as an error, so that a search is
+    not held by the prior less than it will be. T errors have room for what misses.
+
+    Args:
+        rival: The model.
+        rms: Root mean square residual of its fit.
+    """
+    return 1.0 if rival.heavy is not None else max(rms, 1.0)
+
+
 def best_fit(rival: Rival, u: Array, unit: Array, settings: FitSettings) -> LinearModel:
     """Return a model linearized at the best fit that searches from draws find.
 
@@ -86,7 +100,7 @@ def best_fit(rival: Rival, u: Array, unit: Array, settings: FitSettings) -> Line
     half = own.num_starts // 2
     far = order[half :: own.num_starts][: own.num_starts - half]
     u = np.concatenate([u[order[:half]], u[far]])
-    scale = max(float(np.sqrt(np.mean(r[order[0]] ** 2))), 1.0)
+    scale = missed_by(rival, float(np.sqrt(np.mean(r[order[0]] ** 2))))
     u, cost = along_secants(rival, u, unit * scale, own.first)
     best = u[np.argsort(cost)[: own.num_kept]]
     return min((polished(rival, p, unit, own) for p in best), key=lambda fit: fit.cost)
@@ -103,7 +117,7 @@ def polished(rival: Rival, u: Array, unit: Array, settings: FitSettings) -> Line
     """
     model = linearize(rival, u, unit)
     for _ in range(settings.rounds - 1):
-        if model.promised < settings.worth * max(model.rms, 1.0) ** 2:
+        if model.promised < settings.worth * missed_by(rival, model.rms) ** 2:
             break
         new = onward(rival, model, unit, settings.secant)
         if (new == model.u).all():
@@ -121,11 +135,13 @@ def onward(rival: Rival, model: LinearModel, unit: Array, steps: int) -> Array:
         unit: Deviations of residuals in a search, shape (N,) or (2 N,).
         steps: Number of steps at most.
     """
-    scale = max(model.rms, 1.0)
+    scale = missed_by(rival, model.rms)
     wide, num = unit * scale, model.num
-    if np.isfinite(rival.df):
-        wide = wide * model.scale
     r, jacobian = model.residual, model.jacobian
+    if rival.heavy is not None:
+        r = rival.residual(model.u[None])[0][0] / unit
+        slope = deviance_slope(from_deviance(r, rival.heavy[0]), rival.heavy[0])
+        jacobian = (slope * model.scale)[:, None] * jacobian
     if rival.reference is not None:  # deviations have the residuals of a search
         r = rival.residual(model.u[None])[0][0]
         slope = jacobian[num:] / np.sqrt(2)
@@ -147,8 +163,7 @@ def refitted(rival: Rival, model: LinearModel, unit: Array, kept: Array) -> Arra
         unit: Deviations of residuals in a search, shape (N,) or (2 N,).
         kept: Mask of the numbers, shape (N,).
     """
-    weight = model.scale if np.isfinite(rival.df) else 1.0
-    wide, kept = unit * max(model.rms, 1.0) * weight, np.resize(kept, len(unit))
+    wide, kept = unit * missed_by(rival, model.rms), np.resize(kept, len(unit))
 
     def whiten(residual: Array) -> Array:
         return np.where(kept, residual / wide, 0.0)

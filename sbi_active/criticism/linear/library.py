@@ -63,7 +63,7 @@ class Library:
         for start in range(0, len(names), size):
             some = names[start : start + size]
             known = self._at(some)
-            grams = self.errors.grams(self._every.part(known).rows)
+            grams = self.errors.grams(self._every.part(known))
             for new in combinations(some, num):
                 found[new] = self._score(new, known, grams)
         return found

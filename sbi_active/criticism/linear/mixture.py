@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from sbi_active.arrays import Array
-from sbi_active.criticism.linear.model import LinearModel
+from sbi_active.criticism.linear.model import LinearModel, touching
 from sbi_active.inference.sampling.mixtures import log_inside
 from sbi_active.inference.sampling.weights import log_sum_exp
 
@@ -62,6 +62,38 @@ def summed(gram: Array, log_weight: Array, model: LinearModel) -> Mixture:
     off = means - mean
     cov = np.einsum("h,hij->ij", p, covs.reshape(len(p), *covs.shape[2:]))
     return Mixture(total, mean, cov + (p[:, None] * off).T @ off, log_z)
+
+
+def beside_process(
+    model: LinearModel,
+    grams: Callable[[LinearModel], tuple[Array, Array]],
+    left: Callable[[LinearModel, Mixture], Array],
+    df: float,
+    *,
+    rounds: int = 6,
+) -> LinearModel:
+    """Return a model of t errors that they touch where a process beside them leaves.
+
+    A process takes most of what is far out without it. Of Gaussians that touch the
+    density of t errors all give a lower bound; that with the largest is taken.
+
+    Args:
+        model: Linear model, which they touch without a process.
+        grams: Function that gives Gram matrices beside each process, and log weights.
+        left: Function from a model and its posterior to what the likeliest process
+            leaves of its residuals, shape (N,).
+        df: Degrees of freedom.
+        rounds: Number of times that they are moved.
+    """
+    best, largest = model, summed(*grams(model), model).log_evidence
+    error = np.zeros(model.num)  # all of it is the process's
+    for _ in range(rounds):
+        own = touching(model, error, df)
+        found = summed(*grams(own), own)
+        if found.log_evidence > largest:
+            best, largest = own, found.log_evidence
+        error = left(own, found) / own.weight
+    return best
 
 
 def integrated(

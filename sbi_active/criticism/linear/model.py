@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -13,7 +14,8 @@ from scipy.stats import chi2
 from sbi_active.arrays import Array
 from sbi_active.criticism.effects.effect import Effect
 from sbi_active.criticism.results import ModelKey
-from sbi_active.criticism.rivals.error_models import LOG_2PI, student
+from sbi_active.criticism.rivals.error_models import LOG_2PI
+from sbi_active.criticism.rivals.heavy_tails import from_deviance, tangent
 from sbi_active.criticism.rivals.rival import Rival
 from sbi_active.inference.sampling.least_squares import within
 from sbi_active.inference.sampling.mixtures import eigh
@@ -45,6 +47,9 @@ class LinearModel:
             errors have heavy tails, or the simulator is random or gives no number.
         offset: Log densities of the numbers at the best fit less those of Gaussian
             residuals, shape (N,); zero for Gaussian errors that are declared.
+        weight: Deviation of the error by that of the Gaussian which stands for it, of
+            each number, shape (N,), or one; small where a t error is far out.
+        peak: Log density of this Gaussian at its peak, in deviations of the error.
     """
 
     key: ModelKey
@@ -60,6 +65,8 @@ class LinearModel:
     num: int
     scale: Array
     offset: Array
+    weight: Array | float = 1.0
+    peak: Array | float = -0.5 * LOG_2PI
 
     @property
     def cost(self) -> float:
@@ -74,6 +81,11 @@ class LinearModel:
         squares nothing would be left of what the sensor tells.
         """
         return np.concatenate([self.residual[:, None], -self.jacobian], 1)
+
+    @property
+    def errors(self) -> Array:
+        """Residuals in deviations of the error, however far out, shape (N,)."""
+        return self.residual[: self.num] / self.weight
 
     @property
     def rms(self) -> float:
@@ -152,11 +164,19 @@ def linearize(
         step: Step of finite differences; None takes the rival's.
     """
     step = rival.step if step is None else step
-    r, jacobian = rival.jacobian(u[None], lambda residual: residual / unit, step)
+    r, jacobian = rival.jacobian(u[None], partial(_errors_of, rival, unit=unit), step)
     model = with_prior(rival, u, r[0], jacobian[0])
     if rival.simulator.failed or rival.reference is not None:
         model = _in_own_deviations(rival, model, unit)
-    return _reweighted(model, rival.df) if np.isfinite(rival.df) else model
+    if rival.heavy is None:
+        return model
+    return touching(model, model.residual, rival.heavy[0])
+
+
+def _errors_of(rival: Rival, residual: Array, unit: Array) -> Array:
+    """Return the errors, in deviations of the sensor, of the residuals of a search."""
+    residual = residual / unit
+    return residual if rival.heavy is None else from_deviance(residual, rival.heavy[0])
 
 
 def _in_own_deviations(rival: Rival, model: LinearModel, unit: Array) -> LinearModel:
@@ -201,28 +221,24 @@ def _in_own_deviations(rival: Rival, model: LinearModel, unit: Array) -> LinearM
     )
 
 
-def _reweighted(model: LinearModel, df: float) -> LinearModel:
-    r"""Return a linear model of t errors: a Gaussian, wider by what each residual says.
-
-    .. math::
-        w_i^2 = \frac{\nu + 1}{\nu - 2 + r_i^2}
+def touching(model: LinearModel, error: Array, df: float) -> LinearModel:
+    """Return a linear model of t errors as Gaussians that touch their density.
 
     Args:
-        model: Linear model in deviations of the error.
-        df: Degrees of freedom, :math:`\nu`.
-
-    References:
-        Lange, Little & Taylor, Journal of the American Statistical Association 84
-        (1989), for iteratively reweighted least squares of t errors.
+        model: Linear model, of Gaussians that touch it elsewhere or of none yet.
+        error: Errors at which they touch it, in deviations of the error, shape (N,).
+        df: Degrees of freedom.
     """
-    r = model.residual
-    weight = np.sqrt((df + 1) / (df - 2 + r**2))
+    weight, peak = tangent(error, df)
+    change = weight / model.weight
     return replace(
         model,
-        residual=weight * r,
-        jacobian=weight[:, None] * model.jacobian,
-        scale=model.scale / weight,
-        offset=model.offset + student(r, df) + 0.5 * (LOG_2PI + (weight * r) ** 2),
+        residual=change * model.residual,
+        jacobian=change[:, None] * model.jacobian,
+        scale=model.scale / change,
+        offset=model.offset - model.peak + peak,
+        weight=weight,
+        peak=peak,
     )
 
 
@@ -294,7 +310,8 @@ def enlarged(
     u[~new], jacobian[:, ~new] = model.u, model.jacobian
     u[new], jacobian[:, new] = values, columns
     larger = with_prior(rival, u, model.residual, jacobian)
-    return replace(larger, scale=model.scale, offset=model.offset)
+    names = "scale", "offset", "weight", "peak"
+    return replace(larger, **{name: getattr(model, name) for name in names})
 
 
 def chords(
@@ -325,14 +342,15 @@ def chords(
     points[np.arange(len(where)), where] += step
     if not len(where):
         return np.empty((len(model.residual), 0))
-    r, before, num = rival.residual(points)[0] / unit, model.residual, model.num
+    r, before = _errors_of(rival, rival.residual(points)[0], unit), model.residual
+    num = model.num
     if rival.reference is not None:
         # Half of a square is a log; deviations stay those of the fit.
         own = rival.residual(u[None])[0][0]
         change = 0.5 * (r[:, num:] ** 2 - own[num:] ** 2)
         r = np.concatenate([r[:, :num] * np.exp(change), np.sqrt(2) * change], 1)
         before = np.append(before[:num], np.zeros(num))
-    if np.isfinite(rival.df):
+    if rival.heavy is not None:
         r /= model.scale
     return ((r - before) / step[:, None]).T
 

@@ -23,11 +23,13 @@ from sbi_active.criticism.linear.fits import (
     FitSettings,
     along_secants,
     best_fit,
+    missed_by,
     onward,
     polished,
 )
 from sbi_active.criticism.linear.left_out import Candidate, leave_out
 from sbi_active.criticism.linear.library import Library
+from sbi_active.criticism.linear.mixture import Mixture, beside_process
 from sbi_active.criticism.linear.model import (
     LinearModel,
     at_null,
@@ -80,7 +82,7 @@ class Search:
             self.rivals.measurements,
             self.unit,
             self.sensor,
-            largest=bare.rms,
+            largest=float(np.sqrt(np.mean(bare.errors**2))),
             warm_up=self.rivals.warm_up if self.rivals.nuisances else 0.0,
             varying=bare.jacobian[: bare.num, bare.trial_of < 0],
         )
@@ -90,6 +92,12 @@ class Search:
     def names(self) -> list[str]:
         """Effects that change the prediction, of which sets are fitted."""
         return [e.name for e in self.rivals.effects.values() if e.hook != "noise"]
+
+    @property
+    def heavy(self) -> tuple[float, Array] | None:
+        """Degrees of freedom and deviation of t errors; None where errors are none."""
+        df = self.sensor.cells[0].df
+        return (df, self.unit) if np.isfinite(df) else None
 
     @cached_property
     def library(self) -> Library:
@@ -102,7 +110,7 @@ class Search:
 
     def keep(self, model: LinearModel) -> Candidate:
         """Record a fitted model with its evidence."""
-        grams = self.errors.grams(model.rows)
+        grams = self.errors.grams(model)
         sensor, beside = (
             self.errors.mixture(model, grams, beside=beside) for beside in (False, True)
         )
@@ -178,11 +186,30 @@ class Search:
         if (key := own.tobytes()) not in self._processes:
             process = self.rivals.residual_process(self.sensor, own)
             self._processes[key] = process
-        rows, unit = model.rows, self.unit[own]
-        own_rows = unit[:, None] * rows[: model.num][own]
-        grams, log_weight = self._processes[key].grams(own_rows)
-        grams = grams + self.errors.unchanged(rows, use)
-        return grams, log_weight + np.log(unit).sum()  # of sensor deviations
+        process, unit = self._processes[key], self.unit[own]
+
+        def beside(at: LinearModel) -> tuple[ResidualProcess, Array]:
+            weight = np.broadcast_to(at.weight, at.num)[own]
+            heavy = self.errors.is_heavy
+            return process.beside(weight) if heavy else process, unit / weight
+
+        def grams(at: LinearModel) -> tuple[Array, Array]:
+            joint, wide = beside(at)
+            found, log_p = joint.grams(wide[:, None] * at.rows[: at.num][own])
+            gained = np.log(wide) + (at.offset - model.offset)[own]  # sensor deviations
+            return found + self.errors.unchanged(at.rows, use), log_p + gained.sum()
+
+        if not self.errors.is_heavy:
+            return grams(model)
+
+        def left(at: LinearModel, found: Mixture) -> Array:
+            joint, wide = beside(at)
+            rest = at.at(found.mean[None])[0]
+            rest[own] = joint.left(wide * rest[own]) / wide
+            return rest
+
+        df = self.sensor.cells[0].df
+        return grams(beside_process(model, grams, left, df))
 
     @property
     def explains(self) -> bool:
@@ -266,7 +293,7 @@ class Search:
         if key not in self._rivals:
             is_random = self.rivals.simulator.is_stochastic
             reference = self.unit if is_random else None
-            given = {"reference": reference, "df": self.sensor.cells[0].df}
+            given = {"reference": reference, "heavy": self.heavy}
             self._rivals[key] = self.rivals.rival(key, **given)
         return self._rivals[key]
 
@@ -278,7 +305,7 @@ class Search:
         for name in key.effects:
             if name not in base.effects:
                 model = self._with_column(model, parent, name)
-        secant, unit = self.settings.secant, self.units * max(model.rms, 1.0)
+        secant, unit = self.settings.secant, self.units * missed_by(rival, model.rms)
         fits = [self._polished(rival, onward(rival, model, self.units, secant))]
         effects = [self.rivals.effects[n] for n in key.effects]
         is_far = not all(map(has_null, effects))

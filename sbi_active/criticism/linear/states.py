@@ -134,8 +134,7 @@ class States:
                 log_p = np.concatenate([log_p, smooth[1]])
         elif key.error is None and (louder := self.louder(key)):
             scale = self._scales(louder)[1]
-            gram, log_p = errors.scaled(c.model.rows, scale, some)
-            log_p = log_p - np.log(len(scale))
+            gram, log_p = errors.scaled(c.model, scale, some)
         log_p = log_p + self._beside_numbers(c, key.error, some)
         return summed(gram, log_p, c.model)
 

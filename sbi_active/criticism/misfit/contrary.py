@@ -115,8 +115,7 @@ def _told(evaluation: Evaluation) -> NDArray[np.bool_]:
 def _rmse(evaluation: Evaluation, told: NDArray[np.bool_]) -> tuple[float, float]:
     """Return the error before and after, over some of the scored trials."""
     if told.all():
-        rmse = evaluation.table.set_index("metric").to_dict("index")["rmse"]
-        return rmse["before"], rmse["after"]
+        return evaluation.rmse
     before, after = (
         float(np.sqrt(np.mean(scores["rmse"][told] ** 2)))
         for scores in (evaluation.before, evaluation.after)
@@ -163,10 +162,8 @@ def judged(
     effects = {e.name: e for e in rivals.library}
     if not any(is_force(effects[name]) for name in tracing.chosen):
         return tracing
-    if evaluation is not None:
-        rmse = evaluation.table.set_index("metric").to_dict("index")["rmse"]
-        if rmse["ratio"] >= 1:
-            return replace(withdrawn(tracing), refuted=(rmse["before"], rmse["after"]))
+    if evaluation is not None and evaluation.rmse[1] >= evaluation.rmse[0]:
+        return replace(withdrawn(tracing), refuted=evaluation.rmse)
     return replace(tracing, stand_in=(*_reasons(rivals, tracing, evaluation),))
 
 
@@ -208,16 +205,17 @@ def beyond_bounds(found: Verdict, rivals: RivalSet, tracing: Tracing) -> Tracing
     sides = {key: _sides(rivals.fits[known]) for key, known in keys.items()}
     if not any(side.any() for side in sides.values()):
         return _unless_none(tracing, Bounds())
+    heavy = found.search.heavy
     (last, u), rival = [*fits.items()][-1], rivals.rival(own)
     whiten = rivals.noise.whitener(rival.residual(u[None])[0][0])  # errors may last
-    best = _refitted(rivals, rivals.rival(last), whiten, [u])
+    best = _refitted(rivals, rivals.rival(last, heavy=heavy), whiten, [u])
     assert best is not None
     square, bounds, dim = best[1], Bounds(), rival.theta_dim
     spare = max(rival.num_observed - rival.dim, 1)
     for key, side in sides.items():
         if not side.any():
             continue
-        rival, point = _moved(rivals.rival(key), side), fits[key]
+        rival, point = _moved(rivals.rival(key, heavy=heavy), side), fits[key]
         starts = [point, np.r_[u[:dim], point[dim:]]]
         again = _refitted(rivals, rival, whiten, starts)
         held = _held(rivals, side, rival, again)

@@ -97,7 +97,7 @@ def gained_by_guesses(search: Search, key: ModelKey, name: str) -> float:
 
 def _log_evidence(search: Search, model: LinearModel, *, beside: bool = True) -> float:
     """Return the log evidence of a model that was not simulated, nats."""
-    grams = search.errors.grams(model.rows)
+    grams = search.errors.grams(model)
     return search.errors.mixture(model, grams, beside=beside).log_evidence
 
 

@@ -247,8 +247,8 @@ class Contents:
     @property
     def rmse(self) -> tuple[float, float]:
         """Root mean square error before and after, where trials were scored."""
-        before, after = self.before_after.set_index("metric").loc["rmse"].iloc[:2]
-        return float(before), float(after)
+        assert self.evaluation is not None
+        return self.evaluation.rmse
 
     @property
     def parameters(self) -> pd.DataFrame:

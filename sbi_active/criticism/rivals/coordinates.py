@@ -94,11 +94,6 @@ class SearchCoordinates:
         t = u * self.scale + self.shift
         return np.where(self.is_log, np.exp(np.where(self.is_log, t, 0.0)), t)
 
-    def within(self, z: Array) -> Array:
-        """Return (theta, phi), natural values of shape (n, k), within their bounds."""
-        low, high = (end[: z.shape[1]] for end in self._bounds())
-        return np.clip(z, low, high)
-
     def sides(self, u: Array) -> NDArray[np.int64]:
         """Return the bound at which each of the first coordinates lies, (k,).
 

@@ -19,10 +19,10 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.special import gammaln
 
 from sbi_active.arrays import Array
 from sbi_active.criticism.data.measurements import Measurements
+from sbi_active.criticism.rivals.heavy_tails import student
 from sbi_active.inference.sampling.weights import log_sum_exp
 from sbi_active.seeding import forked_generators
 from sbi_active.simulation.noise.base import NoiseModel
@@ -250,13 +250,6 @@ def drawn(log_p: Array, rng: np.random.Generator) -> tuple[NDArray[np.intp], ...
     flat = log_p.reshape(len(log_p), -1)
     best = np.argmax(flat + rng.gumbel(size=flat.shape), axis=1)  # of softmax
     return np.unravel_index(best, log_p.shape[1:])
-
-
-def student(e: Array, df: float) -> Array:
-    """Return log densities of t errors of unit standard deviation."""
-    log_norm = gammaln(0.5 * (df + 1)) - gammaln(0.5 * df)
-    log_norm -= 0.5 * np.log(np.pi * (df - 2))
-    return log_norm - 0.5 * (df + 1) * np.log1p(e**2 / (df - 2))
 
 
 #: Cells of the correlation time, from half a sample step to twice the recording, and

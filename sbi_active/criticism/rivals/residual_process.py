@@ -20,8 +20,8 @@ References:
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
-from itertools import product
+from copy import copy
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -85,28 +85,49 @@ class ResidualProcess:
         # a factor of two apart where the process may be 500 times the noise.
         self.amplitudes = np.geomspace(1.0, max(largest, 3.0), 10)
         typical = self.typical_sd = noise.typical_sd
-        self._bases: list[_Basis] = []
         units = {False: typical}
         if spread is not None:
             units[True] = self._relative(spread, typical)
         inputs = self._inputs(action, order)
-        for kind, relative in product(range(len(inputs)), units):
-            points = _coordinates(measurements, inputs[kind], measurements.span)
-            features = units[relative][:, None] * _features(*points)
+        self._features = [
+            (kind, relative, units[relative][:, None] * _features(*points))
+            for kind, own in enumerate(inputs)
+            for points in [_coordinates(measurements, own, measurements.span)]
+            for relative in units
+        ]
+        self._bases = self._whitened()
+
+    def _whitened(self) -> list[_Basis]:
+        """Return each process beside each cell of the noise."""
+        found, noise = [], self.noise
+        for kind, relative, features in self._features:
             for k, cell in enumerate(noise.cells):
                 whitened = cell.whiten(features.T).T
                 values, vectors = eigh(whitened.T @ whitened)
                 keep = values > NEGLIGIBLE * max(values.max(), 1e-300)
-                self._bases.append(
+                found.append(
                     _Basis(
                         k,
                         kind,
                         relative,
-                        float(noise.log_prior[k] - np.log(len(inputs) * len(units))),
+                        float(noise.log_prior[k] - np.log(len(self._features))),
                         whitened @ (vectors[:, keep] / np.sqrt(values[keep])),
                         values[keep],
                     )
                 )
+        return found
+
+    def beside(self, weight: Array) -> ResidualProcess:
+        """Return the same process beside a noise of other deviations.
+
+        Args:
+            weight: Inverse factors on the deviations, shape (N,).
+        """
+        new, noise = copy(self), self.noise
+        cells = [replace(cell, sd=cell.sd / weight) for cell in noise.cells]
+        new.noise = replace(noise, cells=cells)
+        new._bases = new._whitened()
+        return new
 
     def log_likelihood(self, residual: Array) -> Array:
         """Return log densities, shape (n,), of residuals, shape (n, N)."""
@@ -206,6 +227,19 @@ class ResidualProcess:
             grams.append(gram.reshape(-1, *gram.shape[2:]))
             logs.append(log_p.ravel())
         return np.concatenate(grams), np.concatenate(logs)
+
+    def left(self, residual: Array) -> Array:
+        """Return what the likeliest process leaves of a residual, shape (N,).
+
+        The noise has no correlation.
+        """
+        joint = self._joint(residual[None])[0]
+        best, size, _ = np.unravel_index(np.argmax(joint), joint.shape)
+        basis, variance = self._bases[best], self.amplitudes[size] ** 2
+        total = 1 + variance * basis.variances
+        cell = self.noise.cells[basis.cell]
+        along = (1 - 1 / total) * (cell.whiten(residual) @ basis.directions)
+        return residual - cell.sd * (basis.directions @ along)
 
     def _each(self, rows: Array) -> Iterator[tuple[Array, Array, Array, Array]]:
         """Yield rows (n, N) whitened by the noise, process by process.

@@ -14,6 +14,7 @@ from sbi_active.criticism.effects.effect import Effect
 from sbi_active.criticism.results import ModelKey, Residuals
 from sbi_active.criticism.rivals.coordinates import SearchCoordinates
 from sbi_active.criticism.rivals.error_models import NoiseGrid, Whitener
+from sbi_active.criticism.rivals.heavy_tails import signed_deviance
 from sbi_active.criticism.rivals.residual_process import ResidualProcess
 from sbi_active.criticism.rivals.trial_simulator import TrialSimulator
 from sbi_active.inference.sampling.weights import log_sum_exp
@@ -92,7 +93,8 @@ class Rival:
         step: Step of finite differences, in u.
         reference: Deviation of a random simulator's numbers, shape (N,), where it is
             part of a sum of squares; None leaves it to the likelihood.
-        df: Degrees of freedom of the error, for the weights of a sum of squares.
+        heavy: Degrees of freedom and deviation, shape (N,), of t errors where a sum of
+            squares has their peaks; None leaves them to the likelihood.
         coordinates: Coordinates of z.
         num_trials: Number of trials.
         num_observed: Number of measured numbers of all trials.
@@ -108,7 +110,7 @@ class Rival:
     center: Array
     step: float = STEP
     reference: Array | None = None
-    df: float = np.inf
+    heavy: tuple[float, Array] | None = None
 
     def __post_init__(self) -> None:
         self.num_trials = len(self.simulator.trials)
@@ -180,6 +182,9 @@ class Rival:
             # Half of its square is the log of a deviation, but for a constant.
             square = LOG_SCALE + 2 * (log_scale - np.log(self.reference))
             residual = np.concatenate([residual, np.sqrt(np.maximum(square, 0))], 1)
+        if self.heavy is not None and penalized:
+            df, sd = self.heavy
+            residual = sd * signed_deviance(residual / sd, df)
         return residual, log_scale, flags
 
     @property

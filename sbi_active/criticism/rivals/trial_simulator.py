@@ -10,6 +10,7 @@ from sbi_active.arrays import Array
 from sbi_active.criticism.data.measurements import Measurements
 from sbi_active.criticism.data.trials import Trials
 from sbi_active.criticism.effects.augmented import AugmentedSimulator
+from sbi_active.criticism.effects.changes import at_times
 from sbi_active.criticism.effects.effect import Context
 from sbi_active.criticism.effects.trial_conditions import (
     conditions_of_trials,
@@ -204,21 +205,19 @@ class TrialSimulator:
 
     def _at_measured_times(self, x: Tensor) -> Array:
         """Return x at the trials' sample times, shape (n, repeats, t * numbers)."""
-        simulated = x.double().numpy()
-        n, repeats, t = simulated.shape[:3]
-        shape = self.measurements.shape[1:]
+        x, shape = x.double(), self.measurements.shape[1:]
         times, own = self.trials.sample_times, self._model_times
         if times is not None and own is not None:
-            stamps = np.broadcast_to(times.double().numpy(), (t, shape[0]))
-            if stamps.shape[1] != len(own) or not np.allclose(stamps, own[None]):
-                simulated = _interpolate(simulated, own, stamps)
-        if simulated.shape[3:] != shape:
+            stamps = times.double().expand(x.shape[2], shape[0])
+            same = stamps.shape[1] == len(own) and np.allclose(stamps, own[None])
+            x = x if same else _interpolate(x, torch.from_numpy(own), stamps)
+        if x.shape[3:] != shape:
             raise ValueError(
-                f"expected trials of the simulator's shape {simulated.shape[3:]}; got "
+                f"expected trials of the simulator's shape {tuple(x.shape[3:])}; got "
                 f"x of shape {shape} a trial; measure what the simulator returns, "
                 "or give sample_times to both"
             )
-        return simulated.reshape(n, repeats, -1)
+        return x.flatten(2).numpy()
 
 
 def _moments(x: Array) -> tuple[Array, Array]:
@@ -236,20 +235,18 @@ def _moments(x: Array) -> tuple[Array, Array]:
     return np.where(enough, mean, np.nan), np.where(enough, sd, np.nan)
 
 
-def _interpolate(x: Array, own: Array, stamps: Array) -> Array:
+def _interpolate(x: Tensor, own: Tensor, stamps: Tensor) -> Tensor:
     """Return x, shape (n, r, t, k, ...), linearly at stamps (t, m); ends are held."""
-    step = np.diff(own).max()
-    low, high = np.nanmin(stamps), np.nanmax(stamps)
-    if low < own[0] - step or high > own[-1] + step:
+    first, last, step = float(own[0]), float(own[-1]), float(own.diff().max())
+    known = stamps[stamps.isfinite()]
+    low, high = float(known.min()), float(known.max())
+    if low < first - step or high > last + step:
         raise ValueError(
-            f"expected sample_times within those of the simulator, {own[0]:g} to "
-            f"{own[-1]:g}; got {low:g} to {high:g}; simulate for longer, or leave "
+            f"expected sample_times within those of the simulator, {first:g} to "
+            f"{last:g}; got {low:g} to {high:g}; simulate for longer, or leave "
             "the samples beyond out"
         )
-    safe = np.where(np.isfinite(stamps), stamps, own[0])
-    at = np.clip(np.searchsorted(own, safe, side="right") - 1, 0, len(own) - 2)
-    weight = np.clip((safe - own[at]) / (own[at + 1] - own[at]), 0.0, 1.0)
-    trial = np.arange(len(stamps))[:, None]
-    low, high = x[:, :, trial, at], x[:, :, trial, at + 1]
-    weight = weight.reshape(1, 1, *weight.shape, *[1] * (x.ndim - 4))
-    return (1 - weight) * low + weight * high
+    rows, wanted = x.flatten(0, 2), stamps.nan_to_num(first).clamp(first, last)
+    every = wanted.repeat(len(rows) // len(wanted), 1), own.expand(len(rows), -1)
+    found = at_times(rows, *every)
+    return found.reshape(*x.shape[:3], *found.shape[1:])

@@ -18,6 +18,7 @@ from sbi_active.criticism.rivals.residual_process import ResidualProcess
 from sbi_active.criticism.rivals.rival import log_outcomes
 from sbi_active.criticism.rivals.rival_set import RivalSet
 from sbi_active.criticism.rivals.trial_simulator import TrialSimulator
+from sbi_active.inference.sampling.least_squares import descend
 from sbi_active.inference.sampling.weights import log_sum_exp
 from sbi_active.seeding import derive_seed, forked_generators
 
@@ -55,23 +56,20 @@ def conditioned(
     z[:, ~own] = fit.rival.coordinates.to_z(u)[:, : c.num_own]
     draws = c.from_z(z)
     draws[:, own] = c.center[own]
-    point, precision = draws.mean(0, keepdims=True), np.maximum(c.precision[own], 1e-6)
 
     def whiten(residual: Array) -> Array:
         return np.where(first, residual / unit, 0.0)
 
-    for again in range(5):  # Gauss-Newton steps, the last one of each draw
-        r, jacobian = rival.jacobian(point, whiten, rivals.step)
-        slope = jacobian[0][:, own]
-        cov = np.linalg.inv(slope.T @ slope + np.diag(precision))
-        if again == 4:
-            draws[:, own] = point[:, own]
-            point, r = draws, whiten(rival.residual(draws)[0])
-        pull = (point[:, own] - c.center[own]) * c.precision[own]
-        point[:, own] -= (r @ slope + pull) @ cov
-        point = np.clip(point, c.low, c.high)
-    point[:, own] += rng.normal(size=(len(u), own.sum())) @ np.linalg.cholesky(cov).T
-    return c.split(np.clip(point, c.low, c.high))
+    middle = np.clip(draws.mean(0, keepdims=True), c.low, c.high)
+    middle, _ = descend(rival, middle, whiten, rivals.step, 10, free=own)
+    slope = rival.jacobian(middle, whiten, rivals.step)[1][0][:, own]
+    precision = np.maximum(c.precision[own], 1e-6)
+    cov = np.linalg.inv(slope.T @ slope + np.diag(precision))
+    draws[:, own] = middle[:, own]
+    pull = (middle[:, own] - c.center[own]) * c.precision[own]
+    draws[:, own] -= (whiten(rival.residual(draws)[0]) @ slope + pull) @ cov
+    draws[:, own] += rng.normal(size=(len(u), own.sum())) @ np.linalg.cholesky(cov).T
+    return c.split(np.clip(draws, c.low, c.high))
 
 
 def is_first_part(m: Measurements, warm_up: float) -> NDArray[np.bool_]:

@@ -64,6 +64,7 @@ def descend(
     step: float,
     iterations: int,
     *,
+    free: NDArray[np.bool_] | None = None,
     center: Array | None = None,
     secant: bool = False,
     known: tuple[Array, Array] | None = None,
@@ -78,6 +79,7 @@ def descend(
         step: Step of finite differences.
         iterations: Number of iterations at most; a start that is expected to gain
             nothing stops.
+        free: Coordinates that are moved, shape (dim,); None takes those that may be.
         center: Center of the penalty, shape (n, dim); None has that of the prior.
         secant: Derivatives are updated from the steps made, by Broyden's rule, and not
             computed again.
@@ -89,7 +91,7 @@ def descend(
     c, dim = problem.coordinates, problem.dim
     weight = c.precision if center is None else floored(problem)
     center = np.broadcast_to(c.center if center is None else center, u.shape)
-    free = problem.searched
+    free = problem.searched if free is None else free
     damping = np.full(len(u), 1e-2)
     u = u.copy()
 
@@ -102,7 +104,7 @@ def descend(
     cost = penalized(r, u, np.arange(len(u)))
     rows = np.arange(len(u))
     for i in range(iterations):
-        part = jac[rows]
+        part = jac[rows] * free  # what is held is known
         normal = np.einsum("nij,nik->njk", part, part) + np.diag(weight)
         gradient = np.einsum("nij,ni->nj", part, r[rows])
         gradient = gradient + (u[rows] - center[rows]) * weight

@@ -71,7 +71,7 @@ def log_mean(logs):
 
 def both_of(errors, model, use=None):
     """Posteriors with the sensor's error, and beside a process."""
-    grams = errors.grams(model.rows)
+    grams = errors.grams(model)
     return [errors.mixture(model, grams, use, beside=b) for b in (False, True)]
 
 
@@ -126,7 +126,7 @@ def test_a_parameter_that_differs_from_trial_to_trial_is_a_dense_integral_too():
 def test_a_bound_of_phi_counts_by_the_posterior_within_it():
     free, errors = problem()
     bounded, _ = problem(low=0.0)
-    grams = errors.grams(free.rows)
+    grams = errors.grams(free)
     use = np.ones(errors.num_folds, bool)
     gram = grams.gram[-1:, use].sum(1)
     log_z, mean, cov = (part[:, 0] for part in integrated(gram, free, [1.0]))

@@ -46,7 +46,7 @@ def test_the_error_falls_on_left_out_trials_or_the_verdict_is_withdrawn(loop):
     assert all(name.endswith("of hinge") for name in evaluation.selected)
     assert loop.judged(evaluation).chosen == loop.trace().chosen
     table = evaluation.table.copy()
-    table.loc[table["metric"] == "rmse", "ratio"] = 1.01
+    table.loc[table["metric"] == "rmse", "after"] = 1.01 * rmse["before"]
     judged = loop.judged(replace(evaluation, table=table))
     assert judged.chosen == ()
     assert judged.verdict == UNEXPLAINED
