@@ -119,3 +119,18 @@ def _is_of_python(value: Any) -> bool:
     while isinstance(value, list | tuple) and value:
         value = value[0]
     return type(value) in (int, float, bool, list, tuple)
+
+
+def distance_from(places: Tensor, rows: Tensor, *, same: float = 1e-6) -> Tensor:
+    """Return the distance of rows from the nearest of some places, shape (n,).
+
+    Args:
+        places: Other rows, shape (t, d).
+        rows: Rows, shape (n, d); distances are in their ranges.
+        same: Distance below which two rows are the same, at a distance of 0.
+    """
+    rows, places = rows.double(), places.double()
+    width = rows.max(0).values - rows.min(0).values
+    width = torch.where(width > 0, width, torch.ones_like(width))
+    distance = torch.cdist(rows / width, places / width).min(1).values
+    return torch.where(distance < same, 0.0, distance)

@@ -136,8 +136,7 @@ def summary(rows: list[dict[str, Any]]) -> str:
                 "simulator's": f"{part['simulator_s'].median():.2f}",
             }
         )
-    cells = [[str(value) for value in line.values()] for line in lines]
-    return Table([*lines[0]], cells).text()
+    return Table([*lines[0]], [[*map(str, line.values())] for line in lines]).text()
 
 
 main = benchmark(

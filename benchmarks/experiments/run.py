@@ -39,7 +39,7 @@ from benchmarks.misfit.cases import draw_case
 from benchmarks.misfit.truth import Truth
 from benchmarks.rows import benchmark
 from sbi_active import DiscreteActions
-from sbi_active.actions.space import distance_from
+from sbi_active.arrays import distance_from
 from sbi_active.criticism import Report, close_loop
 from sbi_active.criticism.experiments.settle import with_trial
 from sbi_active.display.table import Table

@@ -90,16 +90,3 @@ class ActionSpace(ABC):
                 f"expected {dim} names and units, one an entry of the action; got "
                 f"{self.names} and {self.units}; give one each"
             )
-
-
-def distance_from(places: Tensor, actions: Tensor) -> Tensor:
-    """Return the distance of actions from the nearest of some places, shape (a,).
-
-    Args:
-        places: Other actions, shape (t, action_dim).
-        actions: Actions, shape (a, action_dim); distances are in their ranges.
-    """
-    actions, places = actions.double(), places.double()
-    width = actions.max(0).values - actions.min(0).values
-    width = torch.where(width > 0, width, torch.ones_like(width))
-    return torch.cdist(actions / width, places / width).min(1).values

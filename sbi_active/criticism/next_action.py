@@ -12,8 +12,7 @@ import torch
 from torch import Tensor
 
 from sbi_active.actions import ActionSpace, DiscreteActions
-from sbi_active.actions.space import distance_from
-from sbi_active.arrays import Array
+from sbi_active.arrays import Array, distance_from
 from sbi_active.criticism.contradictions import SevereTest
 from sbi_active.criticism.data.trials import Trials
 from sbi_active.criticism.effects.trial_conditions import are_known, unmeasured
@@ -60,8 +59,6 @@ class PlanSettings:
 
 
 PLAN = PlanSettings()
-#: Distance, in ranges of the actions, below which two are the same.
-SAME = 1e-6
 
 
 def permitted_candidates(rivals: RivalSet, actions: ActionSpace) -> Tensor:
@@ -381,7 +378,7 @@ def _most_severe(
     # What helps beside a named cause is not what is to be tested.
     names = (tracing.misfit and tracing.misfit.named) or tracing.chosen
     difference = np.min([difference_without(name) for name in names], axis=0)
-    tried = distance_from(rivals.trials.action, candidates).numpy() < SAME
+    tried = distance_from(rivals.trials.action, candidates).numpy() == 0
     best = int(np.argmax(np.where(tried & ~tried.all(), -1.0, difference)))
     return SevereTest(
         action=candidates[best].double().numpy(),

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from sbi_active.actions import ActionSpace, DiscreteActions
-from sbi_active.actions.space import distance_from
+from sbi_active.arrays import distance_from
 from sbi_active.campaign.learning.learner import Learner
 from sbi_active.campaign.learning.methods import find_method
 from sbi_active.campaign.learning.pooled import PooledLearner

@@ -13,10 +13,9 @@ from scipy import stats
 from scipy.optimize import brentq
 from scipy.special import gammaln
 
-from sbi_active.actions.space import distance_from
+from sbi_active.arrays import distance_from
 from sbi_active.criticism.criticism import Criticism
 from sbi_active.criticism.next_action import (
-    SAME,
     following,
     permitted_candidates,
     severe_tests,
@@ -116,7 +115,7 @@ def choose(criticism: Criticism, report: Report, settling: Settling) -> Choice |
         return chosen
     candidates = permitted_candidates(rivals, actions)
     distance = distance_from(rivals.trials.action, candidates)
-    if distance.max() < SAME:
+    if not distance.any():
         return None
     action = candidates[int(distance.argmax())].double().numpy()
     return Choice(action, "shows the residual where no trial was")
