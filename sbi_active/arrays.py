@@ -132,5 +132,8 @@ def distance_from(places: Tensor, rows: Tensor, *, same: float = 1e-6) -> Tensor
     rows, places = rows.double(), places.double()
     width = rows.max(0).values - rows.min(0).values
     width = torch.where(width > 0, width, torch.ones_like(width))
-    distance = torch.cdist(rows / width, places / width).min(1).values
+    # By products of matrices what is the same is 1e-5 apart, far from 0 in its ranges.
+    exact = "donot_use_mm_for_euclid_dist"
+    apart = torch.cdist(rows / width, places / width, compute_mode=exact)
+    distance = apart.min(1).values
     return torch.where(distance < same, 0.0, distance)

@@ -11,7 +11,7 @@ from sbi_active import (
     InformationGainDesigner,
     SimulatorModel,
 )
-from sbi_active.arrays import measured, own_tensor
+from sbi_active.arrays import distance_from, measured, own_tensor
 from sbi_active.criticism import Trials
 from sbi_active.criticism.data.tables import read_trials
 from sbi_active.criticism.misfit.rule import Rule
@@ -99,3 +99,10 @@ def test_a_warning_points_at_who_read_it(read, tmp_path):
         with pytest.warns(UserWarning, match="1 of 2 cells") as noted:
             read(path)
         assert [note.filename for note in noted] == [__file__]
+
+
+def test_what_was_tried_is_at_a_distance_of_zero_far_from_zero_too():
+    rows = 1e5 + torch.linspace(0, 1, 33, dtype=torch.float64)[:, None]
+    distance = distance_from(rows[[4, 20]], rows)
+    assert torch.nonzero(distance == 0)[:, 0].tolist() == [4, 20]
+    assert float(distance.max()) == pytest.approx(12 / 32)

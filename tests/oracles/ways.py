@@ -69,6 +69,11 @@ def few(own: Problem) -> bool:
     return own.dim <= 4 and own.x.shape[1] <= 10 and not np.isnan(own.x).any()
 
 
+def few_declared(own: Problem) -> bool:
+    """Return whether networks may be trained on noise that the library has."""
+    return few(own) and declared(own)
+
+
 def scalar(own: Problem) -> bool:
     """Return whether outcomes are one number of two parameters at most."""
     return few(own) and own.dim <= 2 and own.x.shape[1] == 1
@@ -149,16 +154,16 @@ WAYS["campaign"] = Way(
 )
 WAYS["max_simulations=1000"] = Way(
     in_campaign(max_simulations=1_000, planned_trials=4),
-    lambda own: few(own) and declared(own),
+    few_declared,
 )
 # Networks alone: with refine=True every method gives the belief of "campaign".
 WAYS["asbi, chained"] = Way(
     in_campaign(method="asbi", refine=False, **SMALL),
-    lambda own: few(own) and declared(own),
+    few_declared,
 )
 WAYS["alhi"] = Way(
     in_campaign(method="alhi", refine=False, **SMALL),
-    lambda own: few(own) and declared(own),
+    few_declared,
 )
 WAYS["seqbed"] = Way(
     in_campaign(method="seqbed", refine=False, num_simulations=2_000),

@@ -96,13 +96,12 @@ def settle(
     scored = evaluate and bool(trials.held_out_positions)
     while True:
         criticism, report = _verdict(compare, trials, first, tested, evaluate=scored)
-        is_last = len(tested) >= max_trials
-        choice = None if is_last else choose(criticism, report, settling)
-        enough = 1 if choice is None else settling.tests
-        stopped = "settled" * is_settled(report, settling, enough)
-        if choice is None or stopped:
+        is_last, choice = len(tested) >= max_trials, None
+        if not (is_last or is_settled(report, settling, settling.tests)):
+            choice = choose(criticism, report, settling)
+        if choice is None:  # fewer tests settle where no action is left
             why = "no trials are left" if is_last else "no permitted action tells more"
-            stopped = stopped or why
+            stopped = "settled" if is_settled(report, settling) else why
             break
         registered = register(criticism, report, choice, _next_index(trials))
         journal.write("registered", **vars(registered))

@@ -83,10 +83,6 @@ class TestedTrial:
         """Distance of the outcome from the prediction, in its standard deviations."""
         return self.off(self.registered.mean, self.registered.sd)
 
-    def distance_without(self, name: str) -> float:
-        """Return the distance from what is predicted without an effect."""
-        return self.off(self.registered.without[name], self.registered.sd)
-
     @property
     def is_measured(self) -> bool:
         """Whether it gave a number that was predicted; else it holds nothing to."""
@@ -210,15 +206,17 @@ class Contents:
     def left_by(self, name: str) -> float:
         """Return the share of the squared error that an effect left of predictions.
 
-        They are those of models that had it, in their standard deviations, and those of
-        the same models without it; NaN if no trial tested it.
+        That of models that had it, by that of the same models without it, in their
+        standard deviations; NaN if no trial tested it, infinite if the latter is 0.
 
         Args:
             name: Name of the effect.
         """
         own = [t for t in self.measured if name in t.registered.without]
-        left = sum(t.distance**2 for t in own)
-        return left / sum(t.distance_without(name) ** 2 for t in own) if own else np.nan
+        without = [t.off(t.registered.without[name], t.registered.sd) for t in own]
+        if not any(without):
+            return np.inf if own else np.nan
+        return sum(t.distance**2 for t in own) / sum(d**2 for d in without)
 
     @property
     def guess(self) -> str | None:

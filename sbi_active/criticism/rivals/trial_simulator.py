@@ -238,8 +238,9 @@ def _moments(x: Array) -> tuple[Array, Array]:
 def _interpolate(x: Tensor, own: Tensor, stamps: Tensor) -> Tensor:
     """Return x, shape (n, r, t, k, ...), linearly at stamps (t, m); ends are held."""
     first, last, step = float(own[0]), float(own[-1]), float(own.diff().max())
-    known = stamps[stamps.isfinite()]
-    low, high = float(known.min()), float(known.max())
+    is_known = stamps.isfinite()
+    low = float(stamps.where(is_known, torch.inf).min())
+    high = float(stamps.where(is_known, -torch.inf).max())
     if low < first - step or high > last + step:
         raise ValueError(
             f"expected sample_times within those of the simulator, {first:g} to "

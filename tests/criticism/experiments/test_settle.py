@@ -153,6 +153,10 @@ def test_an_effect_is_withdrawn_by_the_rule_that_named_it():
         assert after(*tested).verdict == "lag"
     for tested in ([off(1.1 * remaining)], [off(0.2), off(0.4)]):
         assert after(*tested).verdict == "unexplained"
+    exact = replace(
+        trial, registered=replace(own, without={"lag": own.mean}), x=own.mean
+    )
+    assert after(exact).verdict == "unexplained"  # without it predicted as well
     found = after(replace(trial, registered=replace(own, without={})))
     assert (found.verdict, found.tracing.beside) == ("unexplained", ("lag",))
     assert found.tracing.key == report.tracing.key  # it still predicts
