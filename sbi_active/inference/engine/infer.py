@@ -250,7 +250,7 @@ class _Modes:
         fixed = self._log_free(free) if free.any() else 0.0
         num = int(own.per_parameter * len(axes) * own.num_effective)
         most = own.budget(len(axes)) / potential.num_trials
-        num = max(int(min(num, most / own.passes)), own.fewest_particles)
+        few = max(int(min(num, most / own.passes)), own.fewest_particles)
 
         def whole(u: Array) -> Array:
             full = np.zeros((len(u), potential.dim))
@@ -264,17 +264,25 @@ class _Modes:
             return potential.log_likelihood(whole(u))
 
         low, high = potential.coordinates.low[axes], potential.coordinates.high[axes]
-        drawn = start.sample(num, rng)
+        drawn = start.sample(few, rng)
         densities, moved = (log_prior, log_likelihood), None
         if ((drawn < low) | (drawn > high)).any(1).mean() < own.most_cut:
-            moved = bridge(*densities, start, rng, num_particles=num, most=most)
+            moved = bridge(*densities, start, rng, num_particles=few, most=most)
+            if moved is not None:  # as many moves of more particles
+                most -= moved.num_evaluations
+                more = int(min(num, few * most / moved.num_evaluations))
+                if more > few:
+                    again = bridge(
+                        *densities, start, rng, num_particles=more, most=most
+                    )
+                    moved = again or moved
         else:
             response = LinearResponse(potential, self.found, axes)
             precision = potential.coordinates.precision[axes]
             # Far from what is linear the rows may suffice for fewer.
-            for few in dict.fromkeys((num, max(num // 4, own.fewest_particles))):
+            for size in dict.fromkeys((few, max(few // 4, own.fewest_particles))):
                 moves = LineMoves(response, low, high, precision)
-                prior = np.clip(potential.sample_prior(few, rng)[:, axes], low, high)
+                prior = np.clip(potential.sample_prior(size, rng)[:, axes], low, high)
                 moved = led_between(*densities, response, moves, prior, rng, most=most)
                 if moved is not None:
                     break

@@ -34,6 +34,7 @@ class Bridged:
         memory: Largest correlation with where the moves of a step began; those of the
             last may end sooner, where its particles share little.
         num_steps: Number of steps between the two densities.
+        num_evaluations: Number of likelihoods.
     """
 
     u: Array
@@ -44,6 +45,7 @@ class Bridged:
     acceptance: float
     memory: float
     num_steps: int
+    num_evaluations: int
 
 
 def bridge(
@@ -156,7 +158,8 @@ def bridge(
     effective = n / (1 + kept**2 * shared)
     log_l = target - log_prior(u)
     error = float(np.sqrt(2 * variance + 1e-12))
-    return Bridged(u, log_l, log_z, error, effective, acceptance, memory, step)
+    known = log_l, log_z, error, effective, acceptance, memory
+    return Bridged(u, *known, num_steps=step, num_evaluations=spent)
 
 
 class Moves(Protocol):
