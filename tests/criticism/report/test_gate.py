@@ -5,6 +5,7 @@ import json
 import pytest
 import torch
 from sbi.utils import BoxUniform
+from scipy.stats import chi2, norm
 
 from sbi_active import DiscreteActions, GaussianNoise, SimulatorModel
 from sbi_active.criticism import Trials, close_loop, generic_effects
@@ -122,3 +123,30 @@ def test_three_trials_of_which_one_contradicts():
     assert gate.decision == "NOT_ENOUGH_DATA"
     assert gate.details == {"trials": ["2"]}
     assert "trial 2 does not agree" in gate.reason
+
+
+def left_out(x, noise=NOISE):
+    """Return the gate of trials at actions of one, each predicted by the others."""
+    model = SimulatorModel(MODEL.fn, noise=GaussianNoise(noise))
+    trials = Trials(torch.ones(len(x)), x)
+    return close_loop(model, PRIOR, trials, effects=[BIAS], plan=False).gate
+
+
+def test_two_of_five_that_fit_together_are_not_missed():
+    """Both lie outside the others' 90 %: errors of left-out trials share the others."""
+    off = NOISE * torch.tensor([1.7, -1.7, 0.0, 0.0, 0.0])
+    assert (off[0] * 5 / 4) / (NOISE * (1 + 1 / 4) ** 0.5) > norm.ppf(0.95)
+    assert chi2.sf(float((off / NOISE).square().sum()), 4) > 0.2
+    assert left_out(0.7 + off).decision == "SHIP"
+
+
+@pytest.mark.parametrize(("times", "ships"), [(1.2, True), (10.0, False)])
+def test_a_noise_declared_too_large_hides_what_is_missing(times, ships):
+    rank = torch.randperm(80, generator=torch.Generator().manual_seed(0))
+    off = NOISE * norm.ppf((rank.numpy() + 0.5) / 80)
+    gate = left_out(0.7 + torch.tensor(off).float(), noise=times * NOISE)
+    assert (gate.decision == "SHIP") == ships
+    if not ships:
+        left = (off @ off / 79) ** 0.5 / (times * NOISE)
+        assert gate.decision == "NOT_ENOUGH_DATA"
+        assert gate.details["residuals"] == pytest.approx(left, rel=0.02)
