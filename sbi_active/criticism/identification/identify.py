@@ -234,7 +234,7 @@ def _sampled(
     sets, place = np.unique(draws.present, axis=0, return_inverse=True)
     best = int(np.bincount(place).argmax())
     at = rng.permutation(np.flatnonzero(place == best))
-    if not bends(found, at[: own.num_compared], own.linear):
+    if not len(found.others) and not bends(found, at[: own.num_compared], own.linear):
         return draws.u.copy(), float(len(draws.u)), None
     fit, u = sampled(found, sets[best], rng, own.most_simulated), draws.u.copy()
     # Few draws would make for a narrow interval: rather that of the linear model.

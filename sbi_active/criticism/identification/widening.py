@@ -85,8 +85,10 @@ def sampled(
     free, error = linear.free(present.nonzero()[0]), SettledError(linear)
     rival = replace(linear.only(present), error=cast(Any, error))
     u, c = linear.origin + linear.draws.u.mean(0), linear.rival.coordinates
-    near = np.clip(u, c.low, c.high)[free]
-    found = search(rival, rng, near[None], NESTED)
+    near = np.tile(u, (1 + len(linear.others), 1))
+    near[1:, linear.free(())] = linear.others
+    near = np.clip(near, c.low, c.high)[:, free]
+    found = search(rival, rng, near, NESTED)
     settings = Settings(num_simulations=most * rival.num_trials)
     return infer(rival, rng, found=found, settings=settings)
 

@@ -307,6 +307,28 @@ def test_a_prior_of_any_shape_counts():
     assert low < 3.0 < high
 
 
+def test_a_sign_that_no_trajectory_tells_is_open():
+    """Intervals were those of the sign that the search happened to find."""
+    times = torch.linspace(0, 4, 100)
+
+    def swing(theta, xi):
+        return xi * torch.cos(theta * times)
+
+    model = SimulatorModel(swing, noise=GaussianNoise(0.05), sample_times=times)
+    prior = BoxUniform(torch.tensor([-3.0]), torch.tensor([3.0]))
+    gen, xi = torch.Generator().manual_seed(0), torch.tensor([[1.0], [2.0], [0.7]])
+    x = swing(torch.full((3, 1), 1.5), xi)
+    trials = Trials(xi, x + 0.05 * torch.randn(x.shape, generator=gen))
+    settings = IdentifySettings(starts_each=8.0)
+    belief = identify(model, prior, trials, settings=settings)
+    slope = xi * times * torch.sin(1.5 * times) / 0.05
+    exact, rate = slope.square().sum().item() ** -0.5, belief.draws[:, 0]
+    assert rate.abs().mean().item() == pytest.approx(1.5, abs=4 * exact)
+    assert rate.abs().std().item() == pytest.approx(exact, rel=0.1)
+    assert (rate > 0).float().mean().item() == pytest.approx(0.5, abs=0.1)
+    assert belief.diagnostics.trustworthy
+
+
 def test_small_matrices_are_not_shared_by_threads():
     """A second thread spins: it made three of four CPU seconds of a robot's belief."""
     before, seen = torch.get_num_threads(), []

@@ -150,3 +150,18 @@ def test_a_noise_declared_too_large_hides_what_is_missing(times, ships):
         left = (off @ off / 79) ** 0.5 / (times * NOISE)
         assert gate.decision == "NOT_ENOUGH_DATA"
         assert gate.details["residuals"] == pytest.approx(left, rel=0.02)
+
+
+def test_a_parameter_whose_sign_no_trial_tells_is_not_known():
+    """One sign was said to be known to a hundredth, and the gate shipped."""
+    model = SimulatorModel(lambda theta, xi: theta**2 * xi, noise=GaussianNoise(NOISE))
+    gen, xi = torch.Generator().manual_seed(0), torch.linspace(-2, 2, 12)[:, None]
+    x = 4.0 * xi + NOISE * torch.randn(xi.shape, generator=gen)
+    report = close_loop(model, PRIOR, Trials(xi, x), effects=[BIAS], plan=False)
+    assert report.gate.decision == "NOT_ENOUGH_DATA"
+    assert report.gate.details == {"parameters": ["theta_1"]}
+    slope = report.tracing.evidences["none"].draws[:, 0]
+    exact = (xi.square().sum() ** -0.5 * NOISE / 4).item()  # of either sign
+    assert abs(slope).mean() == pytest.approx(2.0, abs=4 * exact)
+    assert abs(slope).std() == pytest.approx(exact, rel=0.2)
+    assert (slope > 0).mean() == pytest.approx(0.5, abs=0.1)
