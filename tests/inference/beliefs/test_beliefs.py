@@ -253,6 +253,22 @@ def test_moments_are_those_of_the_posterior_beside_a_wide_prior(noise):
     assert spread == pytest.approx((0.01 * (1 / 12 + 0.01)) ** 0.5, rel=0.15)
 
 
+@pytest.mark.parametrize("noise", [GaussianNoise(1e-2), None])
+@pytest.mark.parametrize(("truth", "is_at_end"), [(0.5, False), (0.0, True)])
+def test_a_bound_is_far_in_deviations_of_the_belief(noise, truth, is_at_end):
+    """All that lay in the last hundredth of a wide prior was doubted."""
+
+    def line(theta, action):
+        error = 0.0 if noise else 1e-2 * torch.randn(len(theta), 1)
+        return theta * action + error
+
+    simulator = SimulatorModel(line, noise=noise)
+    prior = BoxUniform(torch.zeros(1), torch.full((1,), 100.0))
+    action, off = torch.tensor([[1.0], [2.0]]), torch.tensor([[5e-3], [-5e-3]])
+    belief = refine(simulator, prior, action, truth * action + off, seed=0)
+    assert any("edge" in text for text in belief.diagnostics.warnings) == is_at_end
+
+
 def test_a_belief_is_the_prior_of_the_next_campaign():
     def slide(theta, action):
         return action**2 / (2 * 9.81 * theta)
