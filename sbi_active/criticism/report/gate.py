@@ -13,8 +13,15 @@ from typing import Any, Literal
 import numpy as np
 
 from sbi_active.criticism.report.contents import Contents
-from sbi_active.criticism.report.words import listed, not_told_from, number, stated
+from sbi_active.criticism.report.words import (
+    disagreeing,
+    listed,
+    not_told_from,
+    number,
+    stated,
+)
 from sbi_active.criticism.results import NONE, OUTLIER, ModelKey
+from sbi_active.criticism.rivals.rival import surprising_outcomes
 from sbi_active.criticism.steps.detection import TOO_SMALL
 
 Decision = Literal[
@@ -107,6 +114,11 @@ def gate_of(
         which = f"trials {listed(missed)}" if missed else f"the {num} scored trials"
         reason = f"{which} are far outside what the simulator predicts"
         return Gate("WRONG_MODEL", reason, {"trials": missed, "worst": _worst(report)})
+    rare = surprising_outcomes(report.residuals, level / report.num_trials)
+    if odd := [report.residuals.called(k) for kind in rare for k in kind]:
+        reason = " and ".join(disagreeing(*rare, report.residuals))
+        decision = "WRONG_MODEL" if len(odd) > 1 else "NOT_ENOUGH_DATA"
+        return Gate(decision, reason, {"trials": odd})
     left = found.chi_square / found.degrees_of_freedom
     if found.lower_p_value <= TOO_SMALL and left < 0.5:  # more may hide than is left
         reason = f"residuals are {left**0.5:.2g} times the declared noise, which may "

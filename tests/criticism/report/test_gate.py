@@ -140,6 +140,17 @@ def test_two_of_five_that_fit_together_are_not_missed():
     assert left_out(0.7 + off).decision == "SHIP"
 
 
+@pytest.mark.parametrize(
+    ("num", "decision"), [(1, "NOT_ENOUGH_DATA"), (2, "WRONG_MODEL")]
+)
+def test_what_cannot_be_without_a_measurement_does_not_ship(num, decision):
+    off = NOISE * torch.tensor([0.7, -0.7, 0.0, 0.5, -0.5])
+    gate = left_out(torch.cat([0.7 + off, torch.full((num,), torch.nan)]))
+    assert gate.decision == decision
+    assert gate.details == {"trials": ["5", "6"][:num]}
+    assert "no measurement where the model is sure of one" in gate.reason
+
+
 @pytest.mark.parametrize(("times", "ships"), [(1.2, True), (10.0, False)])
 def test_a_noise_declared_too_large_hides_what_is_missing(times, ships):
     rank = torch.randperm(80, generator=torch.Generator().manual_seed(0))
