@@ -289,6 +289,26 @@ def test_trials_that_disagree_widen_it():
     assert two - one < 0.2 * (high - low)
 
 
+@pytest.mark.parametrize("are_shared", [True, False])
+def test_errors_that_trials_share_count_once(are_shared):
+    """Intervals were half as wide as they had to be, and said to be trustworthy."""
+    rng, times = np.random.default_rng(3), torch.arange(100) / 25
+    error = 0.02 * rng.standard_normal((1 if are_shared else 4, 100))
+    x = 2.0 * torch.exp(-0.8 * times) + torch.tensor(error).float().expand(4, -1)
+    line = SimulatorModel(
+        lambda theta, xi: xi * torch.exp(-theta * times), sample_times=times
+    )
+    trials = Trials(torch.full((4, 1), 2.0), x)
+    belief = identify(line, BoxUniform(torch.zeros(1), torch.full((1,), 3.0)), trials)
+    slope = 2.0 * times * torch.exp(-0.8 * times)
+    one = 0.02 / slope.square().sum().sqrt().item()  # of a single trial
+    low, high = belief.interval()["theta_1"]
+    width = 2 * norm.ppf(0.975) * one * (1.0 if are_shared else 0.5)
+    assert high - low == pytest.approx(width, rel=0.15)
+    codes = [w.code for w in belief.diagnostics.warnings]
+    assert codes == ["SA123"] * are_shared
+
+
 def test_a_prior_of_any_shape_counts():
     """Draws of a gain that nothing tells are those of its skewed prior."""
     shapes, rates = torch.tensor([3.0, 30.0]), torch.tensor([1.0, 30.0])
