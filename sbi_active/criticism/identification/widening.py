@@ -12,11 +12,10 @@ from typing import Any, cast
 import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2, norm, rankdata
-from scipy.stats import f as fisher
 
 from sbi_active.arrays import Array
+from sbi_active.criticism.data.measurements import shared_errors
 from sbi_active.criticism.identification.fitting import Fitted
-from sbi_active.criticism.identification.posterior import TINY
 from sbi_active.criticism.linear.processes import parts_of
 from sbi_active.criticism.rivals.fit import NESTED
 from sbi_active.inference.engine import Fit, infer, search
@@ -153,31 +152,14 @@ def spread(found: Fitted, fewest: int) -> Spread:
 
 
 def shared(found: Fitted) -> tuple[float, float]:
-    """Return how much more alike errors of the trials are than by chance, and its p.
+    """Return how much larger variances are by errors that trials share, and a p-value.
 
-    The posterior takes errors of different trials for independent. What the model lacks
-    may come again at the same times of each; the variance of what a parameter is off by
-    is then as many times larger as that of the sums over trials.
-
-    Args:
-        found: The model, linear.
-
-    Returns:
-        One where errors are independent, the number of trials where they are the same.
+    The posterior takes errors of different trials for independent; the variance of what
+    a parameter is off by grows as that of their sums over trials.
     """
     m, at = found.measurements, found.model.at(found.draws.u.mean(0)[None])[0]
     white = found.whitened(at[:, None], 0 * m.trial)[:, 0]
-    places = np.stack([m.channel, m.time])
-    _, group, count = np.unique(places, axis=1, return_inverse=True, return_counts=True)
-    group, several = group.reshape(-1), count > 1
-    own, freedom = several[group], (several.sum(), (count[several] - 1).sum())
-    if not several.any():
-        return 1.0, 1.0
-    between = (np.bincount(group, white)[several] ** 2 / count[several]).sum()
-    total = (white[own] ** 2).sum()
-    each = between / freedom[0], max(total - between, TINY) / freedom[1]
-    ratio = max(each[0] * own.sum() / max(total, TINY), 1.0)
-    return float(ratio), float(fisher.sf(each[0] / each[1], *freedom))
+    return shared_errors(white, np.stack([m.channel, m.time]))
 
 
 def reflected(u: Array, low: Array, high: Array) -> Array:

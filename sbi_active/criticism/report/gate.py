@@ -119,6 +119,10 @@ def gate_of(
         reason = " and ".join(disagreeing(*rare, report.residuals))
         decision = "WRONG_MODEL" if len(odd) > 1 else "NOT_ENOUGH_DATA"
         return Gate(decision, reason, {"trials": odd})
+    if report.residuals.alike <= TOO_SMALL:
+        reason = "trials share their errors at the same times, as copies do, or what "
+        reason += f"the simulator lacks in each; check their records, or {MORE}"
+        return Gate("NOT_ENOUGH_DATA", reason, {"alike": report.residuals.alike})
     left = found.chi_square / found.degrees_of_freedom
     if found.lower_p_value <= TOO_SMALL and left < 0.5:  # more may hide than is left
         reason = f"residuals are {left**0.5:.2g} times the declared noise, which may "

@@ -151,6 +151,25 @@ def test_what_cannot_be_without_a_measurement_does_not_ship(num, decision):
     assert "no measurement where the model is sure of one" in gate.reason
 
 
+def test_copies_of_trajectories_are_no_further_trials():
+    """Their deviation fell with every copy, and the gate counted each."""
+    times, gen = torch.linspace(0.1, 2.0, 20), torch.Generator().manual_seed(0)
+    model = SimulatorModel(
+        lambda theta, xi: xi * torch.exp(-theta * times),
+        noise=GaussianNoise(NOISE),
+        sample_times=times,
+    )
+    xi = torch.tensor([[3.0], [2.0], [4.0], [5.0]])
+    x = xi * torch.exp(-0.8 * times) + NOISE * torch.randn(4, 20, generator=gen)
+    for copies, decision in ((1, "SHIP"), (3, "NOT_ENOUGH_DATA")):
+        own = [part.repeat(copies, 1) for part in (xi, x)]
+        trials = Trials(*own, sample_times=times)
+        report = close_loop(model, PRIOR, trials, effects=[BIAS], plan=False)
+        assert report.gate.decision == decision
+    assert report.gate.details["alike"] < 1e-4
+    assert "SA534" in [warning.code for warning in report.warnings]
+
+
 @pytest.mark.parametrize(("times", "ships"), [(1.2, True), (10.0, False)])
 def test_a_noise_declared_too_large_hides_what_is_missing(times, ships):
     rank = torch.randperm(80, generator=torch.Generator().manual_seed(0))
