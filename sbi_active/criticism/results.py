@@ -337,6 +337,7 @@ class Evaluation:
         p_value: Tail probability of the chi-square of all scored trials under what the
             model with the effects predicts; NaN where the noise is not declared.
         missed: Held-out trials far outside what that model predicts, farthest first.
+        num_numbers: Number of numbers in all scored trials.
     """
 
     scheme: Literal["held out", "leave one out"]
@@ -348,6 +349,7 @@ class Evaluation:
     names: tuple[str, ...] = ()
     p_value: float = float("nan")
     missed: tuple[MissedTrial, ...] = ()
+    num_numbers: int = 0
 
     @property
     def rmse(self) -> tuple[float, float]:

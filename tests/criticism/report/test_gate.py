@@ -141,6 +141,26 @@ def test_two_of_five_that_fit_together_are_not_missed():
 
 
 @pytest.mark.parametrize(
+    ("off", "decision"),
+    [([2.2, 0.3, -0.5], "SHIP"), ([9.0, 9.0, 9.0], "WRONG_MODEL")],
+)
+def test_one_of_three_outside_its_90_percent_is_chance(off, decision):
+    """A right random simulator has one of three such numbers in 27 % of sets."""
+
+    def line(theta, xi):
+        return theta * xi + NOISE * torch.randn(max(len(theta), len(xi)), 1)
+
+    gen, xi = torch.Generator().manual_seed(0), ACTIONS.values[[*range(9), 1, 4, 7]]
+    error = torch.cat([torch.randn(9, generator=gen), torch.tensor(off)])[:, None]
+    role = ["fit"] * 9 + ["held out"] * 3
+    trials = Trials(xi, 0.7 * xi + NOISE * error, role=role)
+    report = close_loop(SimulatorModel(line), PRIOR, trials, effects=[BIAS], plan=False)
+    assert report.gate.decision == decision
+    within = report.evaluation.before["coverage"].mean()
+    assert within == pytest.approx(2 / 3 if decision == "SHIP" else 0)
+
+
+@pytest.mark.parametrize(
     ("num", "decision"), [(1, "NOT_ENOUGH_DATA"), (2, "WRONG_MODEL")]
 )
 def test_what_cannot_be_without_a_measurement_does_not_ship(num, decision):
