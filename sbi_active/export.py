@@ -14,7 +14,7 @@ from torch.distributions import Distribution
 from sbi_active.arviz_versions import Groups, data_tree, inference_data
 from sbi_active.expected import suggests
 from sbi_active.inference.beliefs.belief import names_of
-from sbi_active.seeding import derive_seed, forked_generators
+from sbi_active.seeding import derive_seed, draws_of, forked_generators
 from sbi_active.simulation import simulate
 
 if TYPE_CHECKING:
@@ -139,8 +139,7 @@ def _add_belief(
 
     Some densities are simulated; a smooth one is not.
     """
-    with forked_generators(seed, "posterior"):
-        theta = belief.sample(torch.Size([num_samples]))
+    theta = draws_of(belief, num_samples, seed, "posterior")
     names = names_of(belief, theta.shape[1]) if names is None else names
     if len(names) != theta.shape[1]:
         raise ValueError(

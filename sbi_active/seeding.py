@@ -20,6 +20,7 @@ from __future__ import annotations
 import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import Any
 
 import numpy as np
 import torch
@@ -83,6 +84,21 @@ def kept_generators() -> Iterator[None]:
             yield
         finally:
             np.random.set_state(numpy_state)
+
+
+def draws_of(distribution: Any, num: int, seed: int, *key: int | str) -> Tensor:
+    """Return draws of a seed of their own, (num, d), for moments and tables.
+
+    Args:
+        distribution: Belief, which knows draws for these, or any distribution.
+        num: Number of draws.
+        seed: The user's seed.
+        key: Purpose of the seed, as in :func:`derive_seed`.
+    """
+    if (quick := getattr(distribution, "quick_sample", None)) is not None:
+        return quick(num, seed=derive_seed(seed, *key) if key else seed)
+    with forked_generators(seed, *key):
+        return distribution.sample(torch.Size([num]))
 
 
 def _devices() -> list[int]:

@@ -23,7 +23,7 @@ from sbi_active.expected import (
 from sbi_active.inference.declared.settings import RefinementOptions
 from sbi_active.inference.networks.mixture_density import MixtureDensity
 from sbi_active.renamed import grouped, takes_loose
-from sbi_active.seeding import derive_seed, forked_generators
+from sbi_active.seeding import draws_of
 from sbi_active.simulation.workers.settings import IN_PROCESS, Workers
 
 
@@ -119,8 +119,7 @@ class StopRules:
                 )
         if self.max_sd is None:
             return None
-        with forked_generators(derive_seed(seed, "stop")):
-            sd = belief.sample(torch.Size([num_draws])).double().std(0)
+        sd = draws_of(belief, num_draws, seed, "stop").double().std(0)
         limits = torch.tensor(self.max_sd, dtype=torch.float64).reshape(-1)
         if len(limits) not in (1, len(sd)):
             raise ValueError(

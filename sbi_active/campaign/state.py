@@ -20,7 +20,7 @@ from sbi_active.campaign.telling import Facts, Health, Status, facts_in
 from sbi_active.design.design import Design
 from sbi_active.inference.emulation.pool import Batch
 from sbi_active.messages import warn
-from sbi_active.seeding import derive_seed, forked_generators
+from sbi_active.seeding import draws_of
 from sbi_active.simulation.workers.store import Meter
 
 #: Ranges of the simulations from the prior beyond all of them at which an outcome is no
@@ -300,13 +300,7 @@ class CampaignState:
         if not self.processed:
             return
         index = self.processed[-1]
-        seed = derive_seed(self.seed, "draws", index)
-        quick = getattr(belief, "quick_sample", None)
-        if quick is not None:
-            draws = quick(num, seed=seed)
-        else:  # the prior, where nothing explained the trials
-            with forked_generators(seed):
-                draws = belief.sample(torch.Size([num]))
+        draws = draws_of(belief, num, self.seed, "draws", index)
         self.draws[index] = draws.reshape(num, -1).detach()
 
     @property

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Literal
 
+import numpy as np
 import pandas as pd
 
 from sbi_active.arrays import Array
@@ -14,6 +15,7 @@ from sbi_active.criticism.contradictions import (
     MissedTrial,
     OutlyingTrial,
 )
+from sbi_active.criticism.data.measurements import shared_errors
 
 #: What is no effect: the bare model, the residual process, noise inflation, and a gross
 #: error of one trial.
@@ -98,6 +100,18 @@ class Residuals:
     probability_valid: Array | None = None
     roughness: Array | None = None
     names: tuple[str, ...] = ()
+
+    @property
+    def alike(self) -> float:
+        """Tail probability of errors as alike at the same times of all trials."""
+        if self.times is None:
+            return 1.0
+        z = self.refitted.reshape(len(self.x), self.x.shape[1], -1)
+        z = z[:, 1:] - self.correlation * z[:, :-1]  # white but for what is shared
+        places = np.arange(z.shape[2]), self.times[..., 1:, None]
+        own = np.stack([np.broadcast_to(place, z.shape) for place in places])
+        seen = np.isfinite(z)
+        return shared_errors(z[seen], own[:, seen])[1]
 
     def called(self, position: int) -> str:
         """Return the name of a trial, or its position without names."""
@@ -323,6 +337,7 @@ class Evaluation:
         p_value: Tail probability of the chi-square of all scored trials under what the
             model with the effects predicts; NaN where the noise is not declared.
         missed: Held-out trials far outside what that model predicts, farthest first.
+        num_numbers: Number of numbers in all scored trials.
     """
 
     scheme: Literal["held out", "leave one out"]
@@ -334,6 +349,7 @@ class Evaluation:
     names: tuple[str, ...] = ()
     p_value: float = float("nan")
     missed: tuple[MissedTrial, ...] = ()
+    num_numbers: int = 0
 
     @property
     def rmse(self) -> tuple[float, float]:

@@ -14,7 +14,7 @@ from sbi_active.design.estimators.base import InformationGainEstimator
 from sbi_active.design.estimators.linear import LinearGain
 from sbi_active.design.estimators.posterior import ParameterGain
 from sbi_active.design.limits import takes_second
-from sbi_active.seeding import forked_generators
+from sbi_active.seeding import draws_of, forked_generators
 from sbi_active.simulation import Simulations
 
 #: "theta", "model", names of parameters, or a function of parameters (n, theta_dim).
@@ -159,8 +159,7 @@ class Quantity:
             if effect.scope == "campaign"
         ]
         self._known: dict[bytes, Tensor] = {}
-        with forked_generators(0, "marginal"):
-            theta = belief.sample(torch.Size([num_draws]))
+        theta = draws_of(belief, num_draws, 0, "marginal")
         value = self._value(theta)
         self.center, self.scale = value.mean(0), value.std(0)
         size = value.abs().amax(0)

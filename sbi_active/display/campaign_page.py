@@ -10,7 +10,7 @@ import numpy as np
 from sbi_active.display.notebook import badge, card, table
 from sbi_active.display.page import Page, Picture, Section
 from sbi_active.display.table import Table
-from sbi_active.seeding import forked_generators
+from sbi_active.seeding import draws_of
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -123,8 +123,7 @@ def page(campaign: Any, num_draws: int = 4_000) -> str:
     figure = campaign.plot(**({"num_predicted": 0} if not campaign.simulator else {}))
     diagnostics = getattr(belief, "diagnostics", None)
     together = getattr(diagnostics, "combinations", None)
-    with forked_generators(0, "page"):
-        draws = belief.sample((num_draws,))
+    draws = draws_of(belief, num_draws, 0, "page")
     known = Table.of_parameters(campaign.parameter_names, draws)
     verdicts = [
         (entry["time"][:16].replace("T", " "), entry["verdict"])

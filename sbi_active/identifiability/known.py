@@ -10,14 +10,13 @@ from textwrap import shorten
 from typing import Any, ClassVar
 
 import numpy as np
-import torch
 from scipy.stats import entropy
 from torch.distributions import Distribution
 
 from sbi_active.arrays import Array
 from sbi_active.identifiability.formula import Combination, Term, linked
 from sbi_active.identifiability.search import FormulaSettings, search, width
-from sbi_active.seeding import forked_generators
+from sbi_active.seeding import draws_of
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -173,8 +172,7 @@ def combinations_of(
     """
     draws = []
     for key, distribution in (("belief", belief), ("prior", prior)):
-        with forked_generators(seed, "combinations", key):
-            drawn = distribution.sample(torch.Size([settings.num_draws]))
+        drawn = draws_of(distribution, settings.num_draws, seed, "combinations", key)
         draws.append(drawn.double().numpy())
     return combinations_of_draws(draws[0], draws[1], names, settings)
 

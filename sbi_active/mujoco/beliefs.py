@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-import torch
 
 from sbi_active.arrays import Array
 from sbi_active.criticism.effects.effect import Effect
@@ -15,7 +14,7 @@ from sbi_active.criticism.identification import IdentifiedBelief, identify
 from sbi_active.expected import require, suggests
 from sbi_active.mujoco.effects.library import likely_effects
 from sbi_active.mujoco.robot import Robot
-from sbi_active.seeding import forked_generators
+from sbi_active.seeding import draws_of
 
 NUM_DRAWS = 10_000
 
@@ -150,6 +149,7 @@ def randomization(
         ValueError: If a level is no probability, or there are no names.
 
     Example:
+        >>> import torch
         >>> from sbi.utils import BoxUniform
         >>> box = BoxUniform(torch.zeros(2), torch.ones(2))
         >>> found = randomization(box, levels=[0.9], names=["mass", "damping"])
@@ -170,8 +170,7 @@ def randomization(
 
 
 def _draws(belief: Any, seed: int) -> Array:
-    with forked_generators(seed, "randomization"):
-        draws = belief.sample(torch.Size([NUM_DRAWS]))
+    draws = draws_of(belief, NUM_DRAWS, seed, "randomization")
     return draws.detach().cpu().double().reshape(NUM_DRAWS, -1).numpy()
 
 

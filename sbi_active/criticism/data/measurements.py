@@ -7,6 +7,7 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.stats import f as fisher
 
 from sbi_active.arrays import Array
 from sbi_active.criticism.data.trials import Trials
@@ -142,3 +143,29 @@ class Measurements:
     def span(self) -> float:
         """Time from the first to the last number."""
         return max(float(np.ptp(self.time)), self.step) if len(self) else 1.0
+
+
+def shared_errors(white: Array, place: Array) -> tuple[float, float]:
+    """Return the variance of errors summed over trials, and its tail probability.
+
+    What a model lacks may come again at the same times of each trial, and copies of a
+    trial have all of its errors. The test is that of an analysis of variance.
+
+    Args:
+        white: Independent errors of equal variance if nothing is shared, shape (N,).
+        place: Channel and time of each, shape (2, N).
+
+    Returns:
+        The variance in units of what independent errors have: one, to the number of
+        trials where all are the same.
+    """
+    _, group, count = np.unique(place, axis=1, return_inverse=True, return_counts=True)
+    several, group = count > 1, group.reshape(-1)
+    own, between, within = several[group], several.sum(), (count[several] - 1).sum()
+    total, sums = (white[own] ** 2).sum(), np.bincount(group, white)[several]
+    if not total:
+        return 1.0, 1.0
+    square = (sums**2 / count[several]).sum()
+    ratio, rest = square / between, max(total - square, 1e-12 * total) / within
+    larger = float(max(ratio * own.sum() / total, 1.0))
+    return larger, float(fisher.sf(ratio / rest, between, within))

@@ -22,7 +22,7 @@ from sbi_active.criticism.identification.posterior import (
     Posterior,
 )
 from sbi_active.criticism.identification.settings import IdentifySettings
-from sbi_active.criticism.linear.fits import best_fit, polished
+from sbi_active.criticism.linear.fits import as_good, best_fits, polished
 from sbi_active.criticism.linear.model import (
     LinearModel,
     at_null,
@@ -53,6 +53,7 @@ class Linear:
         unit: Root mean square residual of each number's channel, shape (N,).
         model: Linear model, in units, whose coordinates count from the origin.
         aliases: Names of effects that are left out since parameters do the same.
+        others: Other fits without effects that are as good, shape (k, d').
     """
 
     rival: Rival
@@ -62,6 +63,7 @@ class Linear:
     unit: Array
     model: LinearModel
     aliases: tuple[str, ...]
+    others: Array
 
     def around(
         self,
@@ -178,9 +180,9 @@ def fitted(
     """
     own, rng = settings, np.random.default_rng(seed)
     bare = _bare(model, prior, trials, beside, own, seed)
-    fit, unit = _searched(bare, own, seed)
+    fit, unit, others = _searched(bare, own, seed)
     doubtful = [e for e in beside if e.scope == "campaign"]
-    linear = _beside(with_effects(bare, doubtful), fit, unit, own)
+    linear = _beside(with_effects(bare, doubtful), fit, unit, others, own)
     m, c = linear.measurements, linear.rival.coordinates
     share = 1.0 if known_sd is None else ((known_sd[m.channel] / unit) ** 2).min()
     filters = Filters(own.errors(m, float(share)), m, 0 * m.trial, m.channel)
@@ -284,8 +286,8 @@ def with_effects(rival: Rival, effects: Sequence[Effect]) -> Rival:
 
 def _searched(
     bare: Rival, settings: IdentifySettings, seed: int
-) -> tuple[LinearModel, Array]:
-    """Return the best fit without effects, and the size of each number's residual."""
+) -> tuple[LinearModel, Array, Array]:
+    """Return the best fit without effects, its residuals' sizes, others as good."""
     own, c = settings, bare.coordinates
     num = max(own.num_screened, own.screened_each * bare.theta_dim)
     u = np.concatenate([np.zeros((1, c.dim)), c.sample(num, seed=seed)])
@@ -299,7 +301,10 @@ def _searched(
         num_starts=max(fit.num_starts, round(own.starts_each * dim)),
         num_kept=max(fit.num_kept, round(own.kept_each * dim)),
     )
-    return _settled(bare, best_fit(bare, u, unit, fit).u, own)
+    first, *others = best_fits(bare, u, unit, fit)
+    best, unit = _settled(bare, first.u, own)
+    u = np.array([other.u for other in others]).reshape(-1, bare.dim)
+    return best, unit, as_good(bare, best, u, unit, fit)
 
 
 def _settled(
@@ -318,7 +323,11 @@ def _sizes(rival: Rival, residual: Array, settings: IdentifySettings) -> Array:
 
 
 def _beside(
-    whole: Rival, bare: LinearModel, unit: Array, settings: IdentifySettings
+    whole: Rival,
+    bare: LinearModel,
+    unit: Array,
+    others: Array,
+    settings: IdentifySettings,
 ) -> Linear:
     """Return a model with effects that are absent so far.
 
@@ -328,6 +337,7 @@ def _beside(
         whole: Rival with all effects.
         bare: Fit without any.
         unit: Units of the residuals, shape (N,).
+        others: Other fits that are as good, shape (k, d').
         settings: Settings of what is told apart.
     """
     own, effects, u = settings, whole.effects, np.zeros(whole.dim)
@@ -335,7 +345,7 @@ def _beside(
     for k, e in enumerate(effects):
         number[places[e.name]] = k
         u[places[e.name]] = at_null(whole, e, own.tried)[0]
-    linear = Linear(whole, effects, number, u, unit, bare, ())
+    linear = Linear(whole, effects, number, u, unit, bare, (), others)
     linear = linear.around(bare, number < 0, unit, own.tried)
     jacobian, basis = linear.model.jacobian, basis_of(bare.jacobian)
     left = jacobian - basis @ (basis.T @ jacobian)

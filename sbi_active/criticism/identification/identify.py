@@ -20,6 +20,7 @@ from sbi_active.criticism.identification.widening import (
     opened,
     reflected,
     sampled,
+    shared,
     spread,
 )
 from sbi_active.expected import suggests
@@ -148,6 +149,11 @@ def identify(
     disagree = least * len(parts.p_value) < own.level
     if disagree:
         u = reflected(parts.widen(u, own.wider, rng), low, high)
+    ratio, alike = shared(found)
+    if alike < own.level:
+        extra = rng.permutation(found.draws.u[:, : u.shape[1]])
+        wider = u + (ratio - 1) ** 0.5 * (extra - extra.mean(0))
+        u = reflected(wider, low, high)
     names = model.parameter_names or [f"theta_{k + 1}" for k in range(u.shape[1])]
     sides = c.sides(u)
     for k in np.flatnonzero(sides):
@@ -166,6 +172,12 @@ def identify(
             f"SA123 single trials disagree about {worst} (p = {least:.1g}): the model "
             "lacks something, and intervals are as wide as they disagree; ask "
             "close_loop what it lacks"
+        )
+    if alike < own.level:
+        notes.append(
+            f"SA123 trials share their errors (p = {alike:.1g}): the model lacks "
+            f"something, and intervals are {ratio**0.5:.2g} times as wide as if they "
+            "did not; ask close_loop what it lacks"
         )
     dim = len(names)
     fewest = max(own.fewest, own.fewest_each * dim * (dim + 3))
@@ -234,7 +246,7 @@ def _sampled(
     sets, place = np.unique(draws.present, axis=0, return_inverse=True)
     best = int(np.bincount(place).argmax())
     at = rng.permutation(np.flatnonzero(place == best))
-    if not bends(found, at[: own.num_compared], own.linear):
+    if not len(found.others) and not bends(found, at[: own.num_compared], own.linear):
         return draws.u.copy(), float(len(draws.u)), None
     fit, u = sampled(found, sets[best], rng, own.most_simulated), draws.u.copy()
     # Few draws would make for a narrow interval: rather that of the linear model.

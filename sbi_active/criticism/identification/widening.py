@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from scipy.stats import chi2, norm, rankdata
 
 from sbi_active.arrays import Array
+from sbi_active.criticism.data.measurements import shared_errors
 from sbi_active.criticism.identification.fitting import Fitted
 from sbi_active.criticism.linear.processes import parts_of
 from sbi_active.criticism.rivals.fit import NESTED
@@ -85,8 +86,10 @@ def sampled(
     free, error = linear.free(present.nonzero()[0]), SettledError(linear)
     rival = replace(linear.only(present), error=cast(Any, error))
     u, c = linear.origin + linear.draws.u.mean(0), linear.rival.coordinates
-    near = np.clip(u, c.low, c.high)[free]
-    found = search(rival, rng, near[None], NESTED)
+    near = np.tile(u, (1 + len(linear.others), 1))
+    near[1:, linear.free(())] = linear.others
+    near = np.clip(near, c.low, c.high)[:, free]
+    found = search(rival, rng, near, NESTED)
     settings = Settings(num_simulations=most * rival.num_trials)
     return infer(rival, rng, found=found, settings=settings)
 
@@ -146,6 +149,17 @@ def spread(found: Fitted, fewest: int) -> Spread:
     p_value = chi2.sf(square, max(freedom, 1))
     whole = np.sqrt(np.diag(np.linalg.inv(total + ridge)))[:own]
     return Spread(p_value, off * np.sqrt(variance), whole)
+
+
+def shared(found: Fitted) -> tuple[float, float]:
+    """Return how much larger variances are by errors that trials share, and a p-value.
+
+    The posterior takes errors of different trials for independent; the variance of what
+    a parameter is off by grows as that of their sums over trials.
+    """
+    m, at = found.measurements, found.model.at(found.draws.u.mean(0)[None])[0]
+    white = found.whitened(at[:, None], 0 * m.trial)[:, 0]
+    return shared_errors(white, np.stack([m.channel, m.time]))
 
 
 def reflected(u: Array, low: Array, high: Array) -> Array:

@@ -9,6 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sbi_active.arrays import Array
 from sbi_active.criticism.linear.model import LinearModel, centered, linearize
@@ -44,6 +45,9 @@ class FitSettings:
             fitted, so that it is not fitted.
         passes: Tail probability of a chi-square from which nothing larger than a pair
             is looked for.
+        alike: Rise of the sum of squares up to which another fit is as good, in units
+            of the residual's own variance: a twentieth of the probability, as in an
+            alarm.
     """
 
     num_starts: int = 24
@@ -63,6 +67,7 @@ class FitSettings:
     max_effects: int = 4
     behind: float = 10.0
     passes: float = 0.01
+    alike: float = 6.0
 
 
 #: Where the simulator jumps a search ends at any of many places near the best one: with
@@ -83,8 +88,10 @@ def missed_by(rival: Rival, rms: float) -> float:
     return 1.0 if rival.heavy is not None else max(rms, 1.0)
 
 
-def best_fit(rival: Rival, u: Array, unit: Array, settings: FitSettings) -> LinearModel:
-    """Return a model linearized at the best fit that searches from draws find.
+def best_fits(
+    rival: Rival, u: Array, unit: Array, settings: FitSettings
+) -> list[LinearModel]:
+    """Return models linearized where searches from draws end, the best fit first.
 
     Half of them begin at the best draws, half at some of the others.
 
@@ -102,8 +109,48 @@ def best_fit(rival: Rival, u: Array, unit: Array, settings: FitSettings) -> Line
     u = np.concatenate([u[order[:half]], u[far]])
     scale = missed_by(rival, float(np.sqrt(np.mean(r[order[0]] ** 2))))
     u, cost = along_secants(rival, u, unit * scale, own.first)
-    best = u[np.argsort(cost)[: own.num_kept]]
-    return min((polished(rival, p, unit, own) for p in best), key=lambda fit: fit.cost)
+    u = u[np.argsort(cost)]
+    fits = [polished(rival, p, unit, own) for p in u[: own.num_kept]]
+    best, u = min(fits, key=lambda fit: fit.cost), u[own.num_kept :]
+    # Whether the end of a search elsewhere is as good shows where it converges.
+    apart = u[_compared(rival, best, u, unit)[1]][: own.num_kept]
+    fits += [polished(rival, p, unit, own) for p in apart]
+    return sorted(fits, key=lambda fit: fit.cost)
+
+
+def as_good(
+    rival: Rival, best: LinearModel, u: Array, unit: Array, settings: FitSettings
+) -> Array:
+    """Return the fits (k, d) among some (n, d) that are as good as the best, and apart.
+
+    What an exchange or another sign of parameters leaves as it is has several.
+
+    Args:
+        rival: The model.
+        best: Best fit, linearized in some units.
+        u: Other fits, shape (n, d).
+        unit: These units, shape (N,).
+        settings: Settings of what is as good.
+    """
+    rise, is_apart = _compared(rival, best, u, unit)
+    return u[(rise < settings.alike * missed_by(rival, best.rms) ** 2) & is_apart]
+
+
+def _compared(
+    rival: Rival, best: LinearModel, u: Array, unit: Array, *, times: float = 10.0
+) -> tuple[Array, NDArray[np.bool_]]:
+    """Return how much more places (n, d) leave than the best fit, and which are apart.
+
+    Those lie in other valleys: the sum of squares rises less than its linear model says
+    by ``times``, an order of magnitude, and that more than draws of one posterior do.
+    """
+    c, places = rival.coordinates, np.concatenate([best.u[None], u])
+    prior = ((places - c.center) ** 2 * c.precision).sum(1)
+    square = ((rival.residual(places)[0] / unit) ** 2).sum(1) + prior
+    linear = (best.at(places) ** 2).sum(1) + prior
+    rise, expected = square[1:] - square[0], linear[1:] - linear[0]
+    least = best.rms**2 * (len(best.u) + 10)
+    return rise, expected > times * np.maximum(rise, least)
 
 
 def polished(rival: Rival, u: Array, unit: Array, settings: FitSettings) -> LinearModel:

@@ -29,7 +29,7 @@ import torch
 from sbi_active.arrays import Array
 from sbi_active.criticism.data.measurements import Measurements
 from sbi_active.criticism.data.trials import Trials
-from sbi_active.criticism.linear.fits import JUMPING, FitSettings, best_fit
+from sbi_active.criticism.linear.fits import JUMPING, FitSettings, best_fits
 from sbi_active.criticism.linear.library import Library
 from sbi_active.criticism.linear.model import LinearModel
 from sbi_active.criticism.linear.processes import series_of
@@ -231,7 +231,7 @@ def linear_models(rivals: RivalSet) -> tuple[Search, Screening | None]:
     settings = JUMPING if rivals.roughness.any() else FitSettings()
     if rivals.noise.is_by_channel:
         own = rivals.rival(ModelKey()), rivals.prior_draws, rivals.noise.typical_sd
-        rivals = _sized(rivals, own[2], [best_fit(*own, settings)])
+        rivals = _sized(rivals, own[2], best_fits(*own, settings)[:1])
     search = Search(rivals, settings)
     if rivals.noise.is_by_channel:
         # What is missing may be seen in one channel alone, and no error of it.

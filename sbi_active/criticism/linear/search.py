@@ -22,7 +22,8 @@ from sbi_active.criticism.linear.errors import Errors
 from sbi_active.criticism.linear.fits import (
     FitSettings,
     along_secants,
-    best_fit,
+    as_good,
+    best_fits,
     missed_by,
     onward,
     polished,
@@ -77,7 +78,9 @@ class Search:
         self._has_larger = False
         self._seed = derive_seed(self.rivals.seed, "misfit")
         own = self.rival(ModelKey()), self.rivals.prior_draws, self.units
-        bare = best_fit(*own, self.settings)
+        bare, *others = best_fits(*own, self.settings)
+        u = np.array([other.u for other in others]).reshape(-1, own[0].dim)
+        self._others = as_good(own[0], bare, u, self.units, self.settings)
         self.errors = Errors(
             self.rivals.measurements,
             self.unit,
@@ -169,6 +172,15 @@ class Search:
             known = [p for p in key.parts if p in self.found]
             self.keep(self._fit(key, known or [ModelKey()]))
         return self.found[key]
+
+    def places(self, key: ModelKey) -> Array:
+        """Return a model's best fit and others that may be as good, shape (k, d).
+
+        The bare model's are where those of larger ones may be.
+        """
+        u = np.tile(self.model(key).u, (1 + len(self._others), 1))
+        u[1:, self.columns(key, ModelKey())] = self._others
+        return u
 
     def smooth(self, model: LinearModel, use: NDArray[np.bool_]) -> tuple[Array, Array]:
         """Return Gram matrices of a model beside a smooth function of the action.

@@ -52,7 +52,7 @@ def posterior(
     if found.is_missed or not _is_likely(found, key) or not bends(search, key):
         return _linear(found, models, key, use, at_best=found.is_missed)
     if use is None and not found.misses(key):
-        fit = models.sampled(key, search.model(key).u[None])
+        fit = models.sampled(key, search.places(key))
         if fit.evidence.effective_sample_size >= fewest:
             log_z = found.states.log_evidence(key)
             return replace(fit, evidence=replace(fit.evidence, log_evidence=log_z))
@@ -95,7 +95,8 @@ def shown(found: Verdict, fit: Fit) -> Fit:
 def bends(search: Search, key: ModelKey) -> bool:
     """Return whether the simulator leaves a linear model where its posterior lies.
 
-    A normal posterior is then another one than the simulator's. It does so from a
+    A normal posterior is then another one than the simulator's, as it is where another
+    fit is as good. It does so from a
     standard deviation of half a nat of the log density ratio of simulator and linear
     model, over 16 draws; with half of it more models are sampled.
 
@@ -106,6 +107,8 @@ def bends(search: Search, key: ModelKey) -> bool:
     rivals = search.rivals
     if not rivals.is_smooth:
         return False  # its jumps leave any model, and count as noise
+    if len(search.places(key)) > 1:
+        return True
     c = search.found[key]
     m, rng = c.model, np.random.default_rng(derive_seed(rivals.seed, "bends"))
     own = c.sensor

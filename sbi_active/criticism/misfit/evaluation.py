@@ -186,6 +186,7 @@ def summary(
         table=pd.DataFrame(rows, columns=pd.Index(columns)),
         selected=selected,
         names=names,
+        num_numbers=int(before["count"].sum()),
     )
 
 

@@ -253,7 +253,7 @@ def cautions(
         few_trials=FEW_TRIALS,
         is_sorted=is_ordered and not fit.action_is_label and _aliased(fit),
         growth=report.growth if is_ordered else None,
-        disagreeing=_disagreeing(own),
+        disagreeing=disagreeing(*surprising_outcomes(own), own),
         rough=None if rough is None else (rough.min(), rough.max()),
         correlation=_correlation(own),
         missed=() if report.evaluation is None else report.evaluation.missed,
@@ -270,15 +270,15 @@ def cautions(
     return (*map(Message, dict.fromkeys(said)),)
 
 
-def _disagreeing(own: Residuals) -> list[str]:
-    """Return the trials whose having an outcome the model holds for improbable."""
+def disagreeing(lost: list[int], kept: list[int], own: Residuals) -> list[str]:
+    """Return the trials whose having an outcome, or none, is improbable, in words."""
     kinds = [
         "gave no measurement where the model is sure of one",
         "gave a measurement where the model is sure of none",
     ]
     return [
         f"trial{'s' * (len(which) > 1)} {', '.join(map(own.called, which))} {what}"
-        for which, what in zip(surprising_outcomes(own), kinds, strict=True)
+        for which, what in zip((lost, kept), kinds, strict=True)
         if which
     ]
 

@@ -13,6 +13,7 @@ from torch.distributions import Distribution
 from sbi_active.arrays import Array
 from sbi_active.criticism.effects.effect import Context, Effect
 from sbi_active.criticism.effects.joint_prior import JointPrior
+from sbi_active.inference.sampling.coordinates import near_ends
 from sbi_active.seeding import forked_generators
 from sbi_active.support import support_bounds, support_of
 
@@ -97,9 +98,9 @@ class SearchCoordinates:
     def sides(self, u: Array) -> NDArray[np.int64]:
         """Return the bound at which each of the first coordinates lies, (k,).
 
-        They lie at one if a twentieth of the draws is near it, within a hundredth of
-        the prior's range. From a deviation of a fifth of that range (of a uniform prior
-        it is .29) trials leave a parameter open: it is near any bound now and then.
+        They lie at one if a twentieth of the draws is near it (:func:`.near_ends`).
+        From a deviation of a fifth of the prior's range (of a uniform prior it is .29)
+        trials leave a parameter open: it is near any bound now and then.
 
         Args:
             u: Draws of a posterior, shape (n, k).
@@ -111,7 +112,7 @@ class SearchCoordinates:
         bounded = np.isfinite(low) & np.isfinite(high)
         low, high = np.where(bounded, low, 0.0), np.where(bounded, high, 1.0)
         place = (u - low) / (high - low)
-        below, above = (place < 0.01).mean(0), (place > 0.99).mean(0)
+        below, above = near_ends(place)
         is_there = np.maximum(below, above) > 0.05
         is_there &= bounded & (place.std(0) <= 0.2)
         return np.where(is_there, np.where(below > above, -1, 1), 0)

@@ -52,21 +52,24 @@ def log_outcomes(
     return log_sum_exp(np.stack(each), axis=0) - np.log(len(rates)) - agreed
 
 
-def surprising_outcomes(residuals: Residuals) -> tuple[list[int], list[int]]:
+def surprising_outcomes(
+    residuals: Residuals, rare: float = 0.05
+) -> tuple[list[int], list[int]]:
     """Return places of trials whose validity the model holds for improbable.
 
     Args:
         residuals: Residuals with the probability of a measurement in each trial.
+        rare: Probability of what happened below which it is improbable.
 
     Returns:
-        Those without a measurement and those with one, of a probability below 1/20.
+        Those without a measurement and those with one.
     """
     p = residuals.probability_valid
     if p is None:
         return [], []
     valid = np.isfinite(residuals.x.reshape(len(p), -1)).any(1)
-    lost = np.flatnonzero(~valid & (p > 0.95))
-    kept = np.flatnonzero(valid & (p < 0.05))
+    lost = np.flatnonzero(~valid & (1 - p < rare))
+    kept = np.flatnonzero(valid & (p < rare))
     return lost.tolist(), kept.tolist()
 
 

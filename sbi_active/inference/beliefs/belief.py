@@ -56,6 +56,10 @@ class Belief(Distribution, ABC):
     def _sample(self, num_samples: int) -> Tensor:
         """Return draws, shape (n, theta_dim), from torch's global generator."""
 
+    def _typical(self, num_samples: int) -> Tensor:
+        """Return draws without a share that guards against errors of the belief."""
+        return self._sample(num_samples)
+
     @abstractmethod
     def _log_prob(self, theta: Tensor) -> Tensor:
         """Return the normalized log density inside the support, (n, d) -> (n,)."""
@@ -73,7 +77,10 @@ class Belief(Distribution, ABC):
             return draws.reshape(*shape, *self.event_shape)
 
     def quick_sample(self, num_samples: int = 2_000, *, seed: int) -> Tensor:
-        """Return draws of a seed of their own, (n, theta_dim), for pictures and tables.
+        """Return draws of a seed of their own, (n, theta_dim), for moments and tables.
+
+        They are of the posterior alone: of the prior's share in a belief, which keeps
+        its density from 0, one draw would outweigh a sharp posterior's deviation.
 
         Args:
             num_samples: Number of draws n.
@@ -83,7 +90,7 @@ class Belief(Distribution, ABC):
             Shape (n, theta_dim), float32.
         """
         with forked_generators(seed), torch.no_grad():
-            return self._sample(num_samples).float()
+            return self._typical(num_samples).float()
 
     def log_prob(self, value: Tensor) -> Tensor:
         """Return the log density, (..., theta_dim) -> (...); -inf off the support."""
@@ -109,18 +116,17 @@ class Belief(Distribution, ABC):
 
     @cached_property
     def _moments(self) -> tuple[Tensor, Tensor]:
-        with forked_generators(0):  # the same belief, the same moments
-            draws = self.sample((self.num_draws,)).double()
+        draws = self.quick_sample(self.num_draws, seed=0).double()
         return draws.mean(0).float(), draws.var(0).float()
 
     @property
     def mean(self) -> Tensor:
-        """Mean over 20,000 draws, shape (theta_dim,)."""
+        """Mean over 20,000 draws of the posterior, shape (theta_dim,)."""
         return self._moments[0]
 
     @property
     def variance(self) -> Tensor:
-        """Variance over 20,000 draws, shape (theta_dim,)."""
+        """Variance over 20,000 draws of the posterior, shape (theta_dim,)."""
         return self._moments[1]
 
     def to_pyro(self) -> Any:

@@ -121,12 +121,19 @@ class EnumeratedBelief(Belief):
         self.values, self.probability = enumeration.values, probability.double()
 
     def _sample(self, num_samples: int) -> Tensor:
+        return self._drawn(num_samples, "_sample")
+
+    @override
+    def _typical(self, num_samples: int) -> Tensor:
+        return self._drawn(num_samples, "_typical")
+
+    def _drawn(self, num_samples: int, kind: str) -> Tensor:
         which = torch.multinomial(self.probability, num_samples, replacement=True)
         drawn = torch.empty(num_samples, *self.event_shape)
         for k, part in enumerate(self.parts):
             rows = (which == k).nonzero()[:, 0]
             if len(rows):
-                own = part._sample(len(rows)).float()
+                own = getattr(part, kind)(len(rows)).float()
                 drawn[rows] = self._enumeration.filled(k, own)
         return drawn
 

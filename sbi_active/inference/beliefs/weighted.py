@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 from torch.distributions import Distribution
+from typing_extensions import override
 
 from sbi_active.arrays import Array
 from sbi_active.inference.beliefs.belief import Belief, within_prior
@@ -78,8 +79,16 @@ class WeightedBelief(Belief):
         return torch.from_numpy(density)
 
     def _sample(self, num_samples: int) -> Tensor:
+        return self._mixed(num_samples, self._defensive)
+
+    @override
+    def _typical(self, num_samples: int) -> Tensor:
+        return self._mixed(num_samples, 0.0)
+
+    def _mixed(self, num_samples: int, share: float) -> Tensor:
+        """Return draws, some of which are the prior's, (num_samples, d)."""
         rng = np.random.default_rng(int(torch.randint(2**62, ())))
-        num_prior = rng.binomial(num_samples, self._defensive)
+        num_prior = rng.binomial(num_samples, share)
         drawn = self._drawn(num_samples - num_prior, rng)
         prior = self._coordinates.sample_prior(num_prior, rng)
         z = rng.permutation(np.concatenate([drawn, prior]))

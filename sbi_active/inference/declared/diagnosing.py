@@ -21,6 +21,7 @@ from sbi_active.arrays import Array
 from sbi_active.inference.beliefs.diagnostics import Assumption, Diagnostics
 from sbi_active.inference.engine import Fit, Settings, SimulatedPotential
 from sbi_active.inference.engine.potential import SimulatedLikelihood
+from sbi_active.inference.sampling.coordinates import near_ends
 from sbi_active.seeding import derive_seed, forked_generators
 
 
@@ -255,8 +256,8 @@ def diagnose_fit(
     """
     base, found, moved = potential.coordinates.base, fit.found, fit.particles
     z = potential.coordinates.to_z(fit.u)
-    near_edge = np.abs(z[:, base.bounded]) > 0.98
-    edge_mass = float((fit.weight @ near_edge).max(initial=0.0))
+    place = 0.5 * (1 + z[:, base.bounded])
+    edge_mass = float(near_ends(place, fit.weight).sum(0).max(initial=0.0))
     rng = np.random.default_rng(derive_seed(seed, "tail"))
     rows = rng.choice(len(z), size=num_checked, p=fit.weight)
     effective, dim = fit.effective_sample_size, int((~fit.free).sum())
@@ -308,7 +309,7 @@ def judged(
         doubts: Things that are taken for granted, by name.
         details: Further figures of what is said of these.
         tails: Tail probability of each trial, and of all.
-        edge_mass: Mass of the belief within 1 % of the edge of one parameter.
+        edge_mass: Mass of the belief near the edges of one parameter.
         edge: Such a mass that calls for a warning.
         rare: Tail probability of the observation that calls for a warning.
         known: Further diagnostics.

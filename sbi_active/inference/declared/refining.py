@@ -130,7 +130,10 @@ class SimulatedBelief(WeightedBelief):
 
     def _drawn(self, num: int, rng: np.random.Generator) -> Array:
         # Resampled: a further likelihood would cost a simulation a trial.
-        return self._z[rng.choice(len(self._z), size=num, p=self._weight)]
+        z = self._z[rng.choice(len(self._z), size=num, p=self._weight)]
+        if not self.free.any():
+            return z
+        return np.where(self.free, self._coordinates.sample_prior(num, rng), z)
 
     def _smooth_log_prob(self, theta: Tensor) -> Tensor:
         z = self._coordinates.to_z(theta)
@@ -148,13 +151,6 @@ class SimulatedBelief(WeightedBelief):
         # So many nats below the defensive share a density is given up.
         floor = self.log_evidence + np.log(self._defensive) - beyond
         return self._likelihood(theta, floor=floor)
-
-    def _sample(self, num_samples: int) -> Tensor:
-        theta = super()._sample(num_samples)
-        if self.free.any():
-            fresh = self.prior.sample(torch.Size([num_samples])).to(theta)
-            theta = torch.where(torch.from_numpy(self.free), fresh, theta)
-        return theta
 
 
 def refine_declared(problem: Problem, past: object) -> SimulatedBelief | None:

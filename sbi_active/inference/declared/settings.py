@@ -25,8 +25,8 @@ class RefinementOptions:
             cost no simulations, 16 times as many.
         defensive: Share of the prior in the belief, so that no parameter is ruled out
             by an error of the surrogate: a truth that it misses costs log(1 / share)
-            nats and not infinitely many. Moments see the share too: .01 of a wide
-            prior outweighs a sharp posterior.
+            nats and not infinitely many. ``sample`` sees the share too; moments,
+            tables and stop rules, which it would outweigh, are of the posterior.
         workers: Workers that run the simulations; in a campaign, its own are taken. A
             history of which a row stays lost is left out.
     """

@@ -20,6 +20,7 @@ from sbi_active.inference.emulation.emulator import EmulatedLikelihood
 from sbi_active.inference.emulation.pool import TrialRows
 from sbi_active.inference.emulation.regression import Regression, is_misfit
 from sbi_active.inference.emulation.stages import EmulationSettings, Stage
+from sbi_active.inference.sampling.coordinates import near_ends
 
 
 def noise_tails(
@@ -241,8 +242,8 @@ def diagnosed(
         known: Further diagnostics.
     """
     last, num, c = stages[-1], len(stages), stages[-1].learned.coordinates
-    edge = np.abs(last.draws[:, c.bounded]) > 0.98
-    edge_mass = float(edge.mean(0).max(initial=0.0))
+    place = 0.5 * (1 + last.draws[:, c.bounded])
+    edge_mass = float(near_ends(place).sum(0).max(initial=0.0))
     effective = min(stage.fit.efficiency for stage in stages)
     change = last.change if num > 1 else -1.0
     is_settled = num > 1 and change <= own.unsettled * c.dim

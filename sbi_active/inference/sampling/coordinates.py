@@ -247,6 +247,26 @@ class NormalCoordinates:
         return bool(torch.allclose(apart, together, rtol=1e-4, atol=1e-3))
 
 
+def near_ends(
+    place: Array, weight: Array | None = None, *, share: float = 0.01, wide: float = 3.0
+) -> Array:
+    """Return the masses of draws near the lower and the upper ends of ranges, (2, d).
+
+    In a wide prior all of a narrow posterior may be in the last hundredth, and far from
+    the end in its own deviations: there the end changes nothing.
+
+    Args:
+        place: Places of the draws between the ends, from 0 to 1, shape (n, d).
+        weight: Weights of the draws, shape (n,); None are equal ones.
+        share: Share of the range that is near an end.
+        wide: Deviations of the draws from it that are.
+    """
+    own = np.full(len(place), 1 / len(place)) if weight is None else weight
+    sd = np.sqrt(own @ (place - own @ place) ** 2)
+    reach = np.clip(wide * sd, 1e-6, share)  # all of them may be at the end
+    return np.stack([own @ (place <= reach), own @ (1 - place <= reach)])
+
+
 def _correlation(y: Array, chance: float) -> Array:
     """Return correlations of draws (n, d) without those that chance may give."""
     raw = np.atleast_2d(np.corrcoef(y.T))

@@ -289,6 +289,26 @@ def test_trials_that_disagree_widen_it():
     assert two - one < 0.2 * (high - low)
 
 
+@pytest.mark.parametrize("are_shared", [True, False])
+def test_errors_that_trials_share_count_once(are_shared):
+    """Intervals were half as wide as they had to be, and said to be trustworthy."""
+    rng, times = np.random.default_rng(3), torch.arange(100) / 25
+    error = 0.02 * rng.standard_normal((1 if are_shared else 4, 100))
+    x = 2.0 * torch.exp(-0.8 * times) + torch.tensor(error).float().expand(4, -1)
+    line = SimulatorModel(
+        lambda theta, xi: xi * torch.exp(-theta * times), sample_times=times
+    )
+    trials = Trials(torch.full((4, 1), 2.0), x)
+    belief = identify(line, BoxUniform(torch.zeros(1), torch.full((1,), 3.0)), trials)
+    slope = 2.0 * times * torch.exp(-0.8 * times)
+    one = 0.02 / slope.square().sum().sqrt().item()  # of a single trial
+    low, high = belief.interval()["theta_1"]
+    width = 2 * norm.ppf(0.975) * one * (1.0 if are_shared else 0.5)
+    assert high - low == pytest.approx(width, rel=0.15)
+    codes = [w.code for w in belief.diagnostics.warnings]
+    assert codes == ["SA123"] * are_shared
+
+
 def test_a_prior_of_any_shape_counts():
     """Draws of a gain that nothing tells are those of its skewed prior."""
     shapes, rates = torch.tensor([3.0, 30.0]), torch.tensor([1.0, 30.0])
@@ -305,6 +325,28 @@ def test_a_prior_of_any_shape_counts():
     assert [*belief.interval()["nothing"]] == pytest.approx(expected, abs=0.12)
     low, high = belief.interval(0.999)["frequency"]
     assert low < 3.0 < high
+
+
+def test_a_sign_that_no_trajectory_tells_is_open():
+    """Intervals were those of the sign that the search happened to find."""
+    times = torch.linspace(0, 4, 100)
+
+    def swing(theta, xi):
+        return xi * torch.cos(theta * times)
+
+    model = SimulatorModel(swing, noise=GaussianNoise(0.05), sample_times=times)
+    prior = BoxUniform(torch.tensor([-3.0]), torch.tensor([3.0]))
+    gen, xi = torch.Generator().manual_seed(0), torch.tensor([[1.0], [2.0], [0.7]])
+    x = swing(torch.full((3, 1), 1.5), xi)
+    trials = Trials(xi, x + 0.05 * torch.randn(x.shape, generator=gen))
+    settings = IdentifySettings(starts_each=8.0)
+    belief = identify(model, prior, trials, settings=settings)
+    slope = xi * times * torch.sin(1.5 * times) / 0.05
+    exact, rate = slope.square().sum().item() ** -0.5, belief.draws[:, 0]
+    assert rate.abs().mean().item() == pytest.approx(1.5, abs=4 * exact)
+    assert rate.abs().std().item() == pytest.approx(exact, rel=0.1)
+    assert (rate > 0).float().mean().item() == pytest.approx(0.5, abs=0.1)
+    assert belief.diagnostics.trustworthy
 
 
 def test_small_matrices_are_not_shared_by_threads():

@@ -59,6 +59,14 @@ def outcomes(lost, probability):
     return {"residuals": found, "residuals_after": found}
 
 
+def repeated(share):
+    """Return residuals along 40 samples, a share of whose variance is that of all."""
+    drawn = np.random.default_rng(0).normal(size=(9, 40))
+    z = share**0.5 * drawn[:1] + (1 - share) ** 0.5 * drawn[1:]
+    made = replace(residuals((40,), times=np.arange(40.0)), refitted=z)
+    return {"residuals": made, "residuals_after": made}
+
+
 def jumps(size):
     made = residuals()
     found = replace(made, roughness=None if size is None else np.full((8, 6), size))
@@ -144,6 +152,7 @@ CASES = {
     ),
     "SA103": (told(bounds=Bounds(parameters=(BOUND,))), told()),
     "SA529": (growing(0.4), growing(0.0)),
+    "SA534": (repeated(0.5) | told("none"), repeated(0.0) | told("none")),
     "SA530": (forced(taken=True), forced(taken=False)),
 }
 

@@ -45,6 +45,7 @@ def test_a_coordinate_is_at_the_bound_where_its_draws_pile_up():
         (1.0 + 0.02 * rng.random((200, 1)), -1),
         (3.0 - 0.02 * rng.random((200, 1)), 1),
         (2.0 + 0.02 * rng.normal(size=(200, 1)), 0),
+        (1.01 + 1e-3 * rng.normal(size=(200, 1)), 0),  # ten deviations from it
         (1.0 + 2.0 * rng.random((200, 1)), 0),  # the trials leave it open
     ):
         whole = np.concatenate([z, np.ones((200, c.dim - 1))], 1)

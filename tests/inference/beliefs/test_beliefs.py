@@ -24,11 +24,11 @@ from torch.distributions import (
 from torch.distributions.transforms import AffineTransform, ExpTransform
 
 from sbi_active import BoxActions, Campaign, GaussianNoise, SimulatorModel
-from sbi_active.inference import refine
+from sbi_active.inference import RefinementOptions, refine
 from sbi_active.inference.beliefs.diagnostics import Assumption, Diagnostics
 from sbi_active.inference.beliefs.enumerated import EnumeratedBelief
 from sbi_active.inference.beliefs.priors import require_support
-from sbi_active.seeding import forked_generators
+from sbi_active.seeding import draws_of, forked_generators
 
 KNOWN = Diagnostics(
     trustworthy=True,
@@ -227,6 +227,46 @@ def test_heavy_tails_and_mixtures_give_the_right_posterior(prior):
     assert bool(((drawn.mean(0) - mean).abs() < 0.2 * sd).all())
     assert bool((drawn.std(0) / sd - 1).abs().max() < 0.2)
     assert bool(belief.log_prob(theta[:100].float()).isfinite().all())
+
+
+@pytest.mark.parametrize("noise", [GaussianNoise(1e-3), None])
+def test_moments_are_those_of_the_posterior_beside_a_wide_prior(noise):
+    """One draw of the prior's share made a deviation twenty times too large."""
+
+    def line(theta, action):
+        error = 0.0 if noise else 1e-3 * torch.randn(len(theta), 1)
+        return theta * action + error
+
+    wide = RefinementOptions(defensive=0.01)
+    action, x = torch.tensor([[1.0], [2.0]]), torch.tensor([[0.4005], [0.8]])
+    prior = BoxUniform(torch.zeros(1), torch.ones(1))
+    simulator = SimulatorModel(line, noise=noise)
+    belief = refine(simulator, prior, action, x, settings=wide, seed=0)
+    exact = 1e-3 * 5**-0.5
+    assert belief.variance.sqrt().item() == pytest.approx(exact, rel=0.1)
+    assert belief.mean.item() == pytest.approx(0.4001, abs=0.2 * exact)
+    drawn = draws_of(belief, 2_000, 0, "any").std().item()
+    assert drawn == pytest.approx(exact, rel=0.1)
+    # What is drawn as from any distribution has the density of the distribution.
+    with forked_generators(0):
+        spread = belief.sample((20_000,)).std().item()
+    assert spread == pytest.approx((0.01 * (1 / 12 + 0.01)) ** 0.5, rel=0.15)
+
+
+@pytest.mark.parametrize("noise", [GaussianNoise(1e-2), None])
+@pytest.mark.parametrize(("truth", "is_at_end"), [(0.5, False), (0.0, True)])
+def test_a_bound_is_far_in_deviations_of_the_belief(noise, truth, is_at_end):
+    """All that lay in the last hundredth of a wide prior was doubted."""
+
+    def line(theta, action):
+        error = 0.0 if noise else 1e-2 * torch.randn(len(theta), 1)
+        return theta * action + error
+
+    simulator = SimulatorModel(line, noise=noise)
+    prior = BoxUniform(torch.zeros(1), torch.full((1,), 100.0))
+    action, off = torch.tensor([[1.0], [2.0]]), torch.tensor([[5e-3], [-5e-3]])
+    belief = refine(simulator, prior, action, truth * action + off, seed=0)
+    assert any("edge" in text for text in belief.diagnostics.warnings) == is_at_end
 
 
 def test_a_belief_is_the_prior_of_the_next_campaign():
