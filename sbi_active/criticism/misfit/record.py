@@ -66,6 +66,7 @@ def traced(
         beside=tuple(n for n in helps if n not in named),
         trial_names=dict(zip(trials.index.tolist(), trials.names, strict=True)),
         p_value=found.p_value,
+        outliers=found.outliers,
         **(_missing(found, models, held_out) if is_missed else _explaining(found)),
     )
     if found.detection.alarm:
@@ -81,7 +82,6 @@ def _explaining(found: Verdict) -> dict[str, Any]:
     gain = states.log_evidence(ModelKey(best.effects, UNEXPLAINED))
     needed = states.needed(ModelKey(found.named), THRESHOLD) if found.named else ()
     return {
-        "outliers": found.outliers,
         "needed": needed,
         "log_process": gain - states.log_evidence(best),
     }

@@ -20,6 +20,7 @@ from sbi_active.criticism.report.words import (
     not_told_from,
     number,
     stated,
+    suspects_in_words,
 )
 from sbi_active.criticism.results import NONE, OUTLIER, ModelKey
 from sbi_active.criticism.rivals.rival import surprising_outcomes
@@ -152,7 +153,8 @@ def _contradicts(report: Contents) -> Gate:
     """Return the decision where one trial does not agree with the others."""
     tracing = report.tracing
     names = [tracing.trial_names.get(i, i) for i in tracing.outliers][:1]
-    reason = f"trial {names[0]} does not agree with the others; check and repeat it"
+    reason = f"{suspects_in_words(tracing)} does not agree with the others; check and "
+    reason += "repeat it"
     return Gate("NOT_ENOUGH_DATA", reason, {"trials": names})
 
 
