@@ -152,9 +152,9 @@ class CampaignTrials(Telling[Trial]):
     def health(self) -> Health:
         """Whether the simulator still explains the trials that the belief contains.
 
-        While it is right, an "alarm" comes in at most 5 % of campaigns, however long
-        they are, and a "watch" now and then. Under an alarm the belief may be narrow
-        and wrong: do :meth:`criticize`.
+        While it is right, at most 5 % of campaigns raise an "alarm", however long they
+        are, and some a "watch". After an alarm the belief may be narrow and wrong: call
+        :meth:`criticize`.
         """
         return assess(self.state)
 

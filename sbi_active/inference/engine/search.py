@@ -207,7 +207,7 @@ def _settled(
 ) -> tuple[Array, Array, Whitener]:
     """Return places, their cost, and the error that the best makes most probable.
 
-    Beyond a sum of squares of ``far`` a number, a place is far from a fit.
+    A place is far from a fit if its mean square exceeds ``far``.
     """
     own, u, cost, stalls = settings, u.copy(), _cost(problem, u, whiten), 0
     for _ in range(own.phases):
