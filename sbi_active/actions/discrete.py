@@ -12,6 +12,7 @@ from typing_extensions import override
 
 from sbi_active.actions.space import ActionSpace
 from sbi_active.arrays import own_tensor
+from sbi_active.expected import require
 from sbi_active.seeding import forked_generators
 
 #: What is taken for an action space: a list stands for its actions.
@@ -52,10 +53,8 @@ class DiscreteActions(ActionSpace):
                 "expected actions of shape (a,) or (a, action_dim) with a >= 1; got "
                 f"{tuple(tensor.shape)}; give one row an action"
             )
-        if not bool(tensor.isfinite().all()):
-            raise ValueError(
-                f"expected finite actions; got {tensor.tolist()}; remove NaN and inf"
-            )
+        is_finite = bool(tensor.isfinite().all())
+        require(is_finite, "finite actions", tensor.tolist(), "remove NaN and inf")
         self.values = tensor
         self._label(names, units)
 
