@@ -48,11 +48,9 @@ class DiscreteActions(ActionSpace):
     ) -> None:
         tensor = own_tensor(values, torch.float32, name="actions")
         tensor = tensor[:, None] if tensor.ndim == 1 else tensor
-        if tensor.ndim != 2 or tensor.numel() == 0:
-            raise ValueError(
-                "expected actions of shape (a,) or (a, action_dim) with a >= 1; got "
-                f"{tuple(tensor.shape)}; give one row an action"
-            )
+        fits, got = tensor.ndim == 2 and tensor.numel() > 0, tuple(tensor.shape)
+        expected = "actions of shape (a,) or (a, action_dim) with a >= 1"
+        require(fits, expected, got, "give one row an action")
         is_finite = bool(tensor.isfinite().all())
         require(is_finite, "finite actions", tensor.tolist(), "remove NaN and inf")
         self.values = tensor

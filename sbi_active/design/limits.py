@@ -106,12 +106,10 @@ class DesignLimits:
         """
         drawn = self.actions.sample((num_draws,), seed=seed)
         drawn = drawn[self(drawn)]
-        if len(drawn) == 0:
-            raise ValueError(
-                f"expected a constraint that permits a part of {self.actions!r}; got "
-                f"none of {num_draws} actions; narrow the space to about what is "
-                "permitted"
-            )
+        expected = f"a constraint that permits a part of {self.actions!r}"
+        got = f"none of {num_draws} actions"
+        advice = "narrow the space to about what it permits"
+        require(len(drawn) > 0, expected, got, advice)
         return drawn
 
     def cost(self, action: Tensor) -> Tensor:

@@ -81,12 +81,9 @@ def revise(state: CampaignState, actions: ActionSpace, report: Report) -> Learne
             f"expected a report; got {report!r:.80}; pass what criticize() returned"
         )
     chosen = report.tracing.chosen
-    if not chosen:
-        raise ValueError(
-            "expected a report whose verdict names effects; got the verdict "
-            f"{report.verdict!r}, which adds none; criticize(effects) with further "
-            "effects, or after further trials"
-        )
+    expected, got = "a report whose verdict names effects", repr(report.verdict)
+    advice = "criticize(effects) with further effects, or after further trials"
+    require(bool(chosen), expected, f"the verdict {got}, which adds none", advice)
     before = state.version
     added: Any = getattr(report.simulator, "effects", ())
     names = [e.name for e in added if e.scope == "campaign"]
