@@ -1,4 +1,4 @@
-"""Values as JSON holds them."""
+"""Values as JSON holds them, and numbers as people read them."""
 
 from __future__ import annotations
 
@@ -27,3 +27,30 @@ def plain(value: Any) -> Any:
         return plain(value.tolist())
     is_lost = isinstance(value, float) and not math.isfinite(value)
     return None if is_lost else value
+
+
+def with_error(mean: float, sd: float) -> str:
+    """Return a mean to the second digit of its deviation; nothing for NaN.
+
+    A mean that is known better than that has six digits.
+
+    Args:
+        mean: Mean of the draws.
+        sd: Standard deviation of the draws.
+
+    Example:
+        >>> with_error(0.35992, 0.00071), with_error(1234.5, 56.7)
+        ('0.35992 +- 0.00071', '1234 +- 57')
+        >>> with_error(159.873313255, 2.8e-14), with_error(-0.003, 1.9)
+        ('159.873 +- 2.8e-14', '0.0 +- 1.9')
+    """
+    if math.isnan(mean):
+        return ""
+    size = abs(mean) + sd
+    if not (sd > 0 and 1e-4 <= size < 1e6):  # powers of ten, or no deviation
+        return f"{mean:.4g} +- {sd:.2g}"
+    places = max(1 - int(f"{sd:.1e}".split("e")[1]), 0)  # after rounding
+    most = max(5 - int(f"{mean:.5e}".split("e")[1]), 0)
+    error = f"{sd:.{places}f}" if places <= most else f"{sd:.2g}"
+    digits = min(places, most)
+    return f"{round(mean, digits) + 0.0:.{digits}f} +- {error}"  # no "-0.0"

@@ -1,8 +1,8 @@
 # %% [markdown]
 # # Your own simulator and robot
 #
-# Ask for an action, run it, tell the outcome. Trials are dear, so all of it is on the
-# disk as it happens, and a campaign that was killed goes on where it was.
+# Ask for an action, run it, tell the outcome. Trials are expensive, so each step is
+# saved immediately, and a campaign that was killed continues where it stopped.
 #
 # A sled is pushed at some speed and slides. Its friction and drag are unknown.
 
@@ -86,8 +86,8 @@ for warning in campaign.belief.diagnostics.warnings:
 # %% [markdown]
 # ## Correct
 #
-# The library never drops a trial silently, and a person's word is a new line in the
-# log. Whatever rested on the trial is computed again.
+# The library never drops a trial silently, and a correction is a new line in the log.
+# Results that depend on the trial are computed again.
 
 # %%
 campaign.correct(2, robot(campaign.history[2].action, 2), reason="read the wrong tape")

@@ -63,8 +63,8 @@ class BoxActions(ActionSpace):
         if not bool(apart.all()):
             raise ValueError(
                 f"expected finite low < high; got {self.low.tolist()} and "
-                f"{self.high.tolist()}; give an entry that does not change to the "
-                "simulator, not to the action"
+                f"{self.high.tolist()}; pass the lower limit first, and leave out "
+                "an entry that does not change"
             )
         self._label(names, units)
 

@@ -12,6 +12,7 @@ from typing_extensions import override
 
 from sbi_active.actions.space import ActionSpace
 from sbi_active.arrays import own_tensor
+from sbi_active.expected import require
 from sbi_active.seeding import forked_generators
 
 #: What is taken for an action space: a list stands for its actions.
@@ -47,15 +48,11 @@ class DiscreteActions(ActionSpace):
     ) -> None:
         tensor = own_tensor(values, torch.float32, name="actions")
         tensor = tensor[:, None] if tensor.ndim == 1 else tensor
-        if tensor.ndim != 2 or tensor.numel() == 0:
-            raise ValueError(
-                "expected actions of shape (a,) or (a, action_dim) with a >= 1; got "
-                f"{tuple(tensor.shape)}; give one row an action"
-            )
-        if not bool(tensor.isfinite().all()):
-            raise ValueError(
-                f"expected finite actions; got {tensor.tolist()}; remove NaN and inf"
-            )
+        fits, got = tensor.ndim == 2 and tensor.numel() > 0, tuple(tensor.shape)
+        expected = "actions of shape (a,) or (a, action_dim) with a >= 1"
+        require(fits, expected, got, "give one row an action")
+        is_finite = bool(tensor.isfinite().all())
+        require(is_finite, "finite actions", tensor.tolist(), "remove NaN and inf")
         self.values = tensor
         self._label(names, units)
 

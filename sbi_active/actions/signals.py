@@ -13,6 +13,7 @@ from typing_extensions import override
 
 from sbi_active.actions.box import BoxActions
 from sbi_active.arrays import own_tensor
+from sbi_active.expected import require
 from sbi_active.seeding import forked_generators
 
 Limit = float | tuple[float, float]
@@ -106,11 +107,9 @@ class SignalActions(BoxActions):
         self._require_names()
         if self._values is not None:
             self._values = self._values[self.permits(self._values)]
-            if not len(self._values):
-                raise ValueError(
-                    f"expected a recorded signal within its limits; got none; {self}; "
-                    "loosen amplitude, rate or duration"
-                )
+            num, expected = len(self._values), "a recorded signal within its limits"
+            advice = "loosen amplitude, rate or duration"
+            require(num > 0, expected, f"none of {self}", advice)
         else:
             self.sample((1,), seed=0)
 
@@ -226,11 +225,9 @@ class SignalActions(BoxActions):
         known = {*self.inputs(some[None])}
         for limits in (self._amplitude, self._rate):
             unknown = {*limits} - known if isinstance(limits, Mapping) else set()
-            if unknown:
-                raise ValueError(
-                    f"expected limits of inputs {', '.join(sorted(known))}; got "
-                    f"{', '.join(sorted(unknown))}; correct the name"
-                )
+            expected = f"limits of inputs {', '.join(sorted(known))}"
+            got = ", ".join(sorted(unknown))
+            require(not unknown, expected, got, "correct the name")
 
 
 def _of(limits: Any, name: str) -> Any:

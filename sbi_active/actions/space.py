@@ -8,6 +8,8 @@ from collections.abc import Iterator, Sequence
 import torch
 from torch import Tensor
 
+from sbi_active.expected import require
+
 
 class ActionSpace(ABC):
     """A set of actions that can be sampled and tested for membership.
@@ -85,8 +87,6 @@ class ActionSpace(ABC):
         default = ["action"] if dim == 1 else [f"action_{i + 1}" for i in range(dim)]
         self.names = default if names is None else [*names]
         self.units = [""] * dim if units is None else [*units]
-        if len(self.names) != dim or len(self.units) != dim:
-            raise ValueError(
-                f"expected {dim} names and units, one an entry of the action; got "
-                f"{self.names} and {self.units}; give one each"
-            )
+        expected = f"{dim} names and units, one an entry of the action"
+        got, fits = f"{self.names} and {self.units}", len(self.names) == dim
+        require(fits and len(self.units) == dim, expected, got, "give one each")

@@ -11,6 +11,7 @@ from typing_extensions import override
 
 from sbi_active.actions.discrete import DiscreteActions
 from sbi_active.actions.space import ActionSpace
+from sbi_active.expected import require
 
 
 class SummaryAction(DiscreteActions):
@@ -73,10 +74,8 @@ class SummaryAction(DiscreteActions):
                     f"expected the summary {label!r} to be a function, or an object "
                     f"with fit and transform; got {type(summary).__name__}; pass one"
                 )
-        if use not in ("best", "chosen"):
-            raise ValueError(
-                f"expected use 'best' or 'chosen'; got {use!r}; pass one of these"
-            )
+        is_known, expected = use in ("best", "chosen"), "use 'best' or 'chosen'"
+        require(is_known, expected, repr(use), "pass one of these")
         self.summaries, self.use = {**summaries}, use
         self.labels = [*map(str, summaries)]
         super().__init__(torch.arange(len(summaries)), names=[name])
@@ -117,9 +116,6 @@ def find_summaries(actions: ActionSpace) -> tuple[SummaryAction, int] | None:
     """
     every = actions.entries()
     found = [(p, own.start) for p, own in every if isinstance(p, SummaryAction)]
-    if len(found) > 1:
-        raise ValueError(
-            f"expected one SummaryAction; got {len(found)} in {actions!r}; pass all "
-            "summaries to one"
-        )
+    got = f"{len(found)} in {actions!r}"
+    require(len(found) <= 1, "one SummaryAction", got, "pass all summaries to one")
     return found[0] if found else None

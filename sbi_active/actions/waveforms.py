@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 
 from sbi_active.arrays import own_tensor
+from sbi_active.expected import require
 
 
 @dataclass(frozen=True)
@@ -193,16 +194,12 @@ class Recorded:
         """
         number = action[:, 0].round().long()
         num = len(self.values)
-        if not bool(((number >= 0) & (number < num)).all()):
-            raise ValueError(
-                f"expected trials 0 to {num - 1}; got {number.tolist()[:6]}; pass the "
-                "number of a recorded one"
-            )
-        if len(input_times) != len(self.input_times):
-            raise ValueError(
-                f"expected the recordings' own {len(self.input_times)} input_times; "
-                f"got {len(input_times)}; leave input_times out"
-            )
+        fits, some = bool(((number >= 0) & (number < num)).all()), number.tolist()[:6]
+        advice = "pass the number of a recorded one"
+        require(fits, f"trials 0 to {num - 1}", some, advice)
+        own, given = len(self.input_times), len(input_times)
+        expected = f"the recordings' own {own} input_times"
+        require(given == own, expected, given, "leave input_times out")
         return {name: u[number].to(action.dtype) for name, u in self.inputs.items()}
 
 
@@ -226,11 +223,8 @@ def _fixed(
     known = [name for name, _ in every]
     found = {name.replace("_", " "): float(value) for name, value in given.items()}
     unknown = {*found} - {*known}
-    if unknown:
-        raise ValueError(
-            f"expected some of {', '.join(known)} to be fixed; got "
-            f"{', '.join(sorted(unknown))}; correct the name"
-        )
+    expected, got = f"some of {', '.join(known)} to be fixed", sorted(unknown)
+    require(not unknown, expected, ", ".join(got), "correct the name")
     return found
 
 

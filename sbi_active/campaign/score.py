@@ -35,8 +35,8 @@ def score_outcome(x: Tensor, simulated: Tensor) -> tuple[float, float]:
     however far the outcome lies: what no draw reaches is no evidence beyond that.
 
     Outcomes without a measurement, or those with one, lie further out the rarer they
-    are. Of a trial that was partly measured only the measured numbers are compared with
-    those of the simulations, so that a sensor that drops out is no surprise. A
+    are. In a partly measured trial, only the measured numbers are compared with those
+    of the simulations, so that a sensor that drops out is no surprise. A
     simulator that itself leaves numbers out may be the cause as well; p is then the
     larger of the two tail probabilities. Numbers that are there where simulations
     seldom have them do count.

@@ -1,4 +1,4 @@
-"""What is told of trials: checked, compared and taken from the log, in plain numbers.
+"""Outcomes of trials: checked, compared and read from the log, as plain numbers.
 
 A campaign tells by these rules, and so does a command that only reads its folder:
 nothing here imports torch.
@@ -60,7 +60,7 @@ class Facts:
 
     @property
     def tells(self) -> tuple[Any, ...]:
-        """What tells about the parameters, bit for bit: farads have no tolerance."""
+        """Status, action and x, compared bit for bit since units may be of any size."""
         return self.status, self.action, self.x
 
 

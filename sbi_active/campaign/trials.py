@@ -21,6 +21,7 @@ from sbi_active.campaign.telling import Facts, Health, Telling, listed
 from sbi_active.display.campaign_figure import plot_campaign
 from sbi_active.display.campaign_page import campaign_html, to_dataframe
 from sbi_active.display.figures import legible
+from sbi_active.expected import require
 from sbi_active.inference.beliefs.belief import named, names_of, parameter_dim
 from sbi_active.inference.rounds.condition import action_rows, outcome_rows
 from sbi_active.messages import warn
@@ -152,9 +153,9 @@ class CampaignTrials(Telling[Trial]):
     def health(self) -> Health:
         """Whether the simulator still explains the trials that the belief contains.
 
-        While it is right, an "alarm" comes in at most 5 % of campaigns, however long
-        they are, and a "watch" now and then. Under an alarm the belief may be narrow
-        and wrong: do :meth:`criticize`.
+        While it is right, at most 5 % of campaigns raise an "alarm", however long they
+        are, and some a "watch". After an alarm the belief may be narrow and wrong: call
+        :meth:`criticize`.
         """
         return assess(self.state)
 
@@ -299,11 +300,8 @@ def outcome_told(x: Any, x_shape: torch.Size) -> Tensor:
     if row.shape != x_shape:
         is_number = row.numel() == x_shape.numel() == 1
         rows = outcome_rows(row.reshape(x_shape) if is_number else row, x_shape)
-        if len(rows) != 1:
-            raise ValueError(
-                f"expected one outcome of shape {tuple(x_shape)}; got {len(rows)}; "
-                "tell one trial at a time"
-            )
+        expected = f"one outcome of shape {tuple(x_shape)}"
+        require(len(rows) == 1, expected, len(rows), "tell one trial at a time")
         row = rows[0]
     infinite = np.isinf(row.numpy())
     if infinite.any():

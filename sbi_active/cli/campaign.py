@@ -15,6 +15,7 @@ import time
 from collections.abc import Callable, Sequence
 from functools import wraps
 from pathlib import Path
+from shlex import quote
 from typing import Any
 
 import click
@@ -140,7 +141,8 @@ def init(folder: Path, method: str, seed: int, **given: Any) -> cli.Answer:
     with Campaign(*problem, directory=folder, **how) as campaign:
         remember(folder, simulator=given["simulator"], noise=given["noise"])
         record.sum_up_campaign(campaign)
-    text = f"{folder}: a campaign of {campaign.actions}\nnext: sbi-active ask {folder}"
+    then = f"next: sbi-active ask {quote(str(folder))}"
+    text = f"{folder}: a campaign of {campaign.actions}\n{then}"
     return cli.Answer({"directory": str(folder)}, text)
 
 
@@ -155,7 +157,7 @@ def ask(campaign: Any, target: str) -> cli.Answer:
     data["notes"] = [*getattr(trial.design, "notes", ())]
     lines = [f"trial {trial.index}: {record.place_of(data)}{tells}"]
     lines += [f"note: {note}" for note in data["notes"]]
-    then = f"then: sbi-active tell {campaign.directory}"
+    then = f"then: sbi-active tell {quote(str(campaign.directory))}"
     return cli.Answer(data, "\n".join([*lines, then]))
 
 

@@ -166,7 +166,9 @@ def misuse(what: str) -> Iterator[None]:
     try:
         yield
     except MISUSES as error:
-        raise ValueError(f"expected {what}; got {error}; correct it") from error
+        said = f"expected {what}; got {error}; correct it"
+        is_whole = str(error).startswith("expected ")
+        raise ValueError(error if is_whole else said) from error
 
 
 def as_line(value: Any) -> str:

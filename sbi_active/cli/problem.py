@@ -30,7 +30,7 @@ from sbi_active.actions import ActionSpace
 from sbi_active.campaign.storage.codec import NotStorableError
 from sbi_active.cli.declare import located, misuse, number_of, pairs_of
 from sbi_active.criticism import Effect, generic_effects
-from sbi_active.expected import require
+from sbi_active.expected import did_you_mean, require
 from sbi_active.simulation import GaussianNoise, SimulatorModel
 from sbi_active.tasks import Task, get_task  # pyright: ignore
 
@@ -61,10 +61,11 @@ def load_module(place: str, here: str | None = None) -> tuple[Any, str]:
         origin = Path(getattr(loaded, "__file__", None) or "built in").resolve()
         alone = "a file whose name no other module has"
         require(file in (None, origin), alone, f"one called as {origin}", "rename it")
-        getattr(loaded, name)
     except (Exception, SystemExit) as error:
         got = f"{located(error)} from {place}"
         raise ValueError(f"expected {expected}; got {got}; correct it") from error
+    advice = did_you_mean(name, vars(loaded), "correct it")
+    require(hasattr(loaded, name), f"a name in {module}", repr(name), advice)
     return loaded, name
 
 

@@ -12,12 +12,14 @@ import json
 import struct
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from shlex import quote
 from types import SimpleNamespace
 from typing import Any
 
 from sbi_active.campaign import telling
 from sbi_active.campaign.telling import Facts, Telling, flat
 from sbi_active.cli.declare import Answer
+from sbi_active.plain import with_error
 from sbi_active.simulation.bank.store import Store
 
 
@@ -196,7 +198,7 @@ def answer_of(campaign: Any) -> Answer:
         left = "" if data["left"] is None else f", {data['left']:.4g} left"
         lines.append(f"{data['spent']:.4g} spent{left}")
     for name, entry in belief["parameters"].items():
-        lines.append(f"{name:>12} = {entry['mean']:.4g} +- {entry['sd']:.2g}")
+        lines.append(f"{name:>12} = {with_error(entry['mean'], entry['sd'])}")
     notes = [belief["combinations"], *belief["warnings"]]
     lines += [f"note: {said}" for said in notes if said]
     if waiting:
@@ -207,7 +209,8 @@ def answer_of(campaign: Any) -> Answer:
 def confirmed(campaign: Any, trial: Any) -> Answer:
     """Return a trial that was told."""
     data = trial_of(campaign, trial)
-    return Answer(data, f"{_line_of(data)}\nnext: sbi-active ask {campaign.directory}")
+    then = f"next: sbi-active ask {quote(str(campaign.directory))}"
+    return Answer(data, f"{_line_of(data)}\n{then}")
 
 
 def place_of(trial: Mapping[str, Any]) -> str:

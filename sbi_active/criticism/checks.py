@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import hashlib
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -28,6 +29,19 @@ from sbi_active.messages import warn
 from sbi_active.seeding import forked_generators
 from sbi_active.simulation import SimulatorModel
 from sbi_active.simulation.noise.estimation import estimate_noise
+
+
+def require_classes(model: Any, prior: Any, trials: Any, effects: Any) -> None:
+    """Raise a TypeError if a part of a loop is of another class."""
+    own = isinstance(effects, Sequence) and all(isinstance(e, Effect) for e in effects)
+    for name, part, fits in (
+        ("model, a SimulatorModel", model, isinstance(model, SimulatorModel)),
+        ("prior, a Distribution", prior, isinstance(prior, Distribution)),
+        ("trials, as Trials", trials, isinstance(trials, Trials)),
+        ("effects, a list of Effect", effects, own),
+    ):
+        if not fits:
+            raise TypeError(f"expected {name}; got {part!r:.80}; pass one")
 
 
 def with_noise(

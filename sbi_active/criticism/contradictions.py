@@ -111,7 +111,7 @@ UNDECLARED = "something undeclared"
 
 @dataclass(frozen=True, kw_only=True)
 class Support:
-    """What speaks for an effect that helps, where every model misses.
+    """Evidence for an effect that helps, where every model misses.
 
     None of it needs calibration, or depends on how fine the sensor is declared.
 

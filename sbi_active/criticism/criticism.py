@@ -13,6 +13,7 @@ from sbi_active.actions import ActionSpace
 from sbi_active.actions.discrete import Actions, action_space
 from sbi_active.criticism.checks import (
     digest,
+    require_classes,
     require_fitting,
     require_warm_up,
     with_noise,
@@ -119,6 +120,7 @@ class Criticism:
         seed: int = 0,
         show_progress: bool = False,
     ) -> None:
+        require_classes(model, prior, trials, effects)
         self.show_progress, self.rule = show_progress, rule
         model = with_noise(model, prior, trials)
         actions = None if actions is None else action_space(actions)

@@ -38,7 +38,7 @@ class PlanSettings:
         nothing: Information below which no action is worth a trial, nats.
         something: Information of another action that is worth a second choice, nats.
         samples: Outcomes of a candidate and rival, half to choose and half to report.
-            Of a half, three quarters fit a density, which needs some tens.
+            Three quarters of a half fit a density, which needs some tens.
         max_tests: Candidates of a severe test beyond the permitted range.
         num_draws: Draws of each prediction in a severe test.
         max_entries: Covariances of the residual process in a severe test.
@@ -73,8 +73,8 @@ def permitted_candidates(rivals: RivalSet, actions: ActionSpace) -> Tensor:
 def simulated(rivals: RivalSet, candidates: Tensor) -> Tensor:
     """Return the candidates at which the bare model gives numbers.
 
-    Beyond the permitted range a simulator may fail in any way. There is nothing beyond
-    labels of trials.
+    A simulator may fail in any way beyond the permitted range. Labels of trials have no
+    such range.
     """
     kept = []
     if rivals.trials.action_is_label:
@@ -179,7 +179,7 @@ class PredictedRival:
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Return draws from the posterior predictive, shape (n, q).
 
-        Beside them are the draws without noise, and its standard deviations.
+        Also returns the draws without noise, and its standard deviations.
 
         Args:
             action: One of the candidates, shape (action_dim,).

@@ -24,8 +24,8 @@ class Design:
         action: The chosen action, shape (action_dim,), or the chosen batch, shape
             (num_actions, action_dim).
         candidates: All candidates that were compared at last, shape (a, action_dim).
-            Of a batch all that follows is about the choice of its last action, given
-            the others: what it tells beyond them.
+            For a batch, all that follows describes its last action: what it tells
+            beyond the others.
         expected_information_gain: Estimates on simulations that had no part in the
             choice, nats, shape (a,); NaN for a random choice.
         standard_error: Standard error of each estimate, shape (a,).

@@ -270,6 +270,13 @@ class GainEvaluator:
         with single_thread():
             known = self.model, halves[0], self.belief, gains[0, active]
             said += self.estimator.compared(*known)
+        # A difference of two bounds is none.
+        bound = "none" if self.num_others else self.estimator.bound_on(self.model)
+        if bound == "lower" and bool((gains[:, active].nanmean((0, 2)) < 0).all()):
+            said.append(
+                "no lower bound is above 0 nats, so that candidates are not ranked; "
+                "declare the noise, SimulatorModel(fn, noise=...), or train on more"
+            )
         return choose(
             limits,
             action=action,
@@ -280,8 +287,7 @@ class GainEvaluator:
             probability_valid=num[0] / num[1].double(),
             num_samples=spent,
             estimator=type(self.estimator).__name__,
-            # A difference of two bounds is none.
-            bound="none" if self.num_others else self.estimator.bound_on(self.model),
+            bound=bound,
             num_simulations=sampler.num_drawn,
             num_missing=sampler.num_missing,
             stopped=stopped,

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from sbi_active.actions import ActionSpace
+from sbi_active.expected import require
 from sbi_active.simulation.conditions import parameters_of
 
 #: Cost of actions (n, action_dim), shape (n,), by these and the action executed before,
@@ -92,11 +93,8 @@ class DesignLimits:
         if values is None:
             return None, ()
         inside = self(values)
-        if not bool(inside.any()):
-            raise ValueError(
-                f"expected a permitted action; got none of {len(values)}; loosen "
-                "constraint="
-            )
+        got = f"none of {len(values)}"
+        require(bool(inside.any()), "a permitted action", got, "loosen constraint=")
         out = int((~inside).sum())
         note = f"{out} of {len(values)} candidates not permitted"
         return values[inside], (note,) if out else ()
@@ -108,12 +106,10 @@ class DesignLimits:
         """
         drawn = self.actions.sample((num_draws,), seed=seed)
         drawn = drawn[self(drawn)]
-        if len(drawn) == 0:
-            raise ValueError(
-                f"expected a constraint that permits a part of {self.actions!r}; got "
-                f"none of {num_draws} actions; narrow the space to about what is "
-                "permitted"
-            )
+        expected = f"a constraint that permits a part of {self.actions!r}"
+        got = f"none of {num_draws} actions"
+        advice = "narrow the space to about what it permits"
+        require(len(drawn) > 0, expected, got, advice)
         return drawn
 
     def cost(self, action: Tensor) -> Tensor:

@@ -179,7 +179,7 @@ class LinearSummaries:
 def leading(rows: Tensor, num: int) -> Tensor:
     """Return orthonormal leading directions (num, N) at most, of rows (n, N), n << N.
 
-    By the inner products of the rows: a tenth of the time of their singular values.
+    Uses inner products of the rows, which takes a tenth of the time of their SVD.
     """
     vectors = torch.linalg.eigh(rows @ rows.T).eigenvectors.flip(1)[:, :num]
     return torch.linalg.qr(rows.T @ vectors).Q.T.contiguous()

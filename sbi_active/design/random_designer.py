@@ -49,7 +49,7 @@ class RandomDesigner(Shown):
             seed: Seed of the choice; None draws one from torch's global generator.
 
         Returns:
-            The design. Of a space without end the candidate is the one drawn.
+            The design. In an infinite space the only candidate is the action drawn.
 
         Raises:
             ValueError: If no action is permitted.

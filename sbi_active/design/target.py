@@ -118,12 +118,12 @@ def _named(names: str | Sequence[str], simulator: Any) -> Callable[[Tensor], Ten
 class Quantity:
     r"""A function :math:`g(\theta)` as few numbers, by which candidates are compared.
 
-    Information about g does not change where g is scaled or shifted. Of more numbers
-    than estimators take, such as a motion's, the leading principal components of the
-    standardized ones stand for all; what an action tells about these is at most what it
-    tells about g. Values that many parameters share, such as a failure or none, get
-    normal noise of a tenth of their deviation, since estimators are of densities; what
-    is told of these is a lower bound that may be .3 nat low, of some hundred draws .5.
+    Information about g does not change where g is scaled or shifted. If g has more
+    numbers than estimators take, as a motion has, the leading principal components of
+    the standardized numbers replace them, which tell at most as much. Values that many
+    parameters share, such as a failure or none, get normal noise of a tenth of their
+    deviation, since estimators need densities; the information is then a lower bound
+    that may be .3 nat low, and .5 with some hundred draws.
 
     Args:
         function: ``g(theta)``, of parameters (n, theta_dim), or ``g(theta, effect)``,

@@ -68,8 +68,8 @@ def search(
     logarithm. The one with the smallest :math:`\sqrt{w^T C w / w^T S w}`, C the
     covariance and S that of the prior, is the last eigenvector of a generalized
     eigenproblem. Pairs come first, then triples, then all parameters at once, each
-    independent of those before. Of the formulas that are about as narrow as the best
-    the simplest is taken.
+    independent of those before. The simplest of the formulas that are about as narrow
+    as the best is taken.
 
     Args:
         moments: Function that returns the covariance C and the prior's S of any terms.
@@ -208,9 +208,9 @@ def _shifted(
 ) -> Iterator[Combination]:
     """Products in which one of two parameters has a number added.
 
-    Of each parameter the best shift and rounder ones, if the best gives a width as
-    small as is needed. Between its neighbors others are tried, so many times: the last
-    are some thousandths of the range apart.
+    These are the best shift of each parameter and rounder ones, if the best gives a
+    width that is small enough. Shifts between its neighbors are then tried so many
+    times that the last are some thousandths of the range apart.
     """
     for i, other in (subset, subset[::-1]):
         if low[other] <= 0:
@@ -268,7 +268,7 @@ def rounded(
 def roundings(values: Array) -> Iterator[Array]:
     """Return numbers near some, the roundest first, these to four digits last.
 
-    Of four numbers or more, small ones may vanish.
+    Small numbers may vanish if there are four or more.
     """
     yield np.copysign(1.0, values)
     simple = np.array([*SIMPLE, 0.0] if len(values) > 3 else SIMPLE)

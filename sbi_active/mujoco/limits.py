@@ -125,8 +125,8 @@ class MotionLimits:
             action: Actions, shape (n, action_dim).
 
         Returns:
-            By name of a joint, of one with " velocity", or of an actuator with
-            " torque": both of shape (n,); NaN where a state diverges.
+            Both of shape (n,), by the name of a joint, a joint with " velocity", or an
+            actuator with " torque"; NaN where a state diverges.
         """
         low, high = self._reached(torch.as_tensor(action).double(), self._theta)
         return {label: (low[:, k], high[:, k]) for k, label in enumerate(self._labels)}

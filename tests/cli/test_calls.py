@@ -113,7 +113,7 @@ CALLS = [
             ("expected MODULE:NAME", "sled"),
             ("add its name behind a colon", "sled.py"),
             ("expected a file; got none at", "torch.py:nn"),
-            ("has no attribute 'none'", "sled.py:none"),
+            ("a name in sled; got 'none'", "sled.py:none"),
             ("expected a function", "odd.py:NUMBER"),
             ("got ZeroDivisionError", "divides.py:f"),
             ("one row a parameter set", "odd.py:short"),
@@ -127,7 +127,7 @@ CALLS = [
             ("expected what 'numerical' needs", "numerical --out o --option target=2"),
             ("expected a task among 'numerical'", "numerica --out d"),
             ("Invalid value for '--rounds': 0", "numerical --out d --rounds 0"),
-            ("expected a setting of", "numerical --out d --set sized=3"),
+            ("expected keywords of", "numerical --out d --set sized=3"),
             ("expected NAME=VALUE; got 'seed'", "numerical --out d --set seed"),
             ("extra argument (seed)", "numerical --out d --set stop=3 seed"),
         )

@@ -88,6 +88,12 @@ def test_a_missing_effect_is_found_and_adopted(
     assert "http" not in page.replace("http-equiv", "")
 
 
+def test_the_next_command_can_be_pasted(camp, capsys):
+    Path("camp").rename("the sled")
+    assert main(["tell", "the sled", "0.7", "--action", "1"]) == 0
+    assert "next: sbi-active ask 'the sled'" in capsys.readouterr().out
+
+
 def test_python_has_the_command_line():
     command = [sys.executable, "-m", "sbi_active", "--version"]
     shown = subprocess.run(command, capture_output=True, text=True, check=True)

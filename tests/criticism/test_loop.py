@@ -28,6 +28,25 @@ def response(theta, action, cubic=0.0):
 MODEL = SimulatorModel(response, noise=GaussianNoise(NOISE), parameter_names=["a", "b"])
 
 
+@pytest.mark.parametrize(
+    ("given", "options", "message"),
+    [
+        ((response, PRIOR, "logs"), {}, "model, a SimulatorModel; got <function"),
+        ((MODEL, PRIOR, "logs"), {}, "trials, as Trials; got 'logs'"),
+        ((MODEL, MODEL, "logs"), {}, "prior, a Distribution; got SimulatorModel"),
+        ((MODEL, PRIOR, Trials([1.0], [1.0])), {"effects": None}, "list .* got None"),
+        (
+            (MODEL, PRIOR, Trials([1.0], [1.0])),
+            {"effects": ["bias"]},
+            r"got \['bias'\]",
+        ),
+    ],
+)
+def test_parts_of_another_class_are_refused(given, options, message):
+    with pytest.raises(TypeError, match=message):
+        close_loop(*given, **options)
+
+
 CUBIC = Effect.keyword("cubic", prior=normal(0.5))
 DRIFT = on_outcomes(
     "drift", lambda x, phi, action, context: x + phi * context.index[:, None], sd=0.2

@@ -32,6 +32,13 @@ def test_it_finds_the_action_that_tells_most():
     assert (design.probability_valid == 1).all()
 
 
+def test_bounds_below_zero_are_noted():
+    designer = InformationGainDesigner(ACTIONS, num_samples=400, estimator="posterior")
+    design = designer.select(ExactModel(spread=0.2), simulator, seed=0)
+    assert (design.expected_information_gain < 0).all()
+    assert design.notes[-1].startswith("no lower bound is above 0 nats")
+
+
 def test_the_choice_and_the_report_use_separate_simulations():
     """With equal candidates the best of the choosing half regresses in the report."""
     equal = DiscreteActions(torch.full((40,), 1.0))

@@ -150,6 +150,7 @@ def test_a_state_that_diverges_is_invalid_and_counted():
     [
         ({"parameters": {"hinge.dampin": (0, 1)}}, "did you mean 'hinge.damping'"),
         ({"parameters": {"bob.mass": (-1, 1)}}, "'bob.mass' from 0 on; got -1 to 1"),
+        ({"parameters": {"hinge.damping": 0.1}}, r"\(low, high\) of .*; got 0.1"),
         ({"times": [1.7e9, 1.7e9 + 1]}, "subtract the time at which the trial starts"),
     ],
 )

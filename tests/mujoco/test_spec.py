@@ -33,6 +33,11 @@ def from_elsewhere(path, monkeypatch):
     return mujoco.MjSpec.from_file("block.xml")
 
 
+def test_a_file_that_is_not_there(tmp_path):
+    with pytest.raises(ValueError, match=r"an MJCF file; got none at .*arm.xml; check"):
+        Source(tmp_path / "arm.xml")
+
+
 @pytest.mark.parametrize("is_spec", [False, True])
 def test_other_processes_find_meshes_beside_the_file(path, monkeypatch, is_spec):
     source = Source(from_elsewhere(path, monkeypatch) if is_spec else path)

@@ -9,6 +9,7 @@ from typing import Any
 from torch.distributions import Distribution
 
 from sbi_active.campaign.options import CampaignOptions
+from sbi_active.expected import require
 from sbi_active.inference import (
     ALHI,
     ASBI,
@@ -78,9 +79,7 @@ def find_method(name: str) -> Method:
     Raises:
         ValueError: If the name is unknown; it lists the valid ones.
     """
-    if not isinstance(name, str) or name not in METHODS:
-        raise ValueError(
-            f"expected method to be one of {', '.join(map(repr, METHODS))}; got "
-            f"{name!r}; choose one of these"
-        )
+    is_known = isinstance(name, str) and name in METHODS
+    expected = f"method to be one of {', '.join(map(repr, METHODS))}"
+    require(is_known, expected, repr(name), "choose one of these")
     return METHODS[name]

@@ -46,11 +46,8 @@ def compare(
     from sbi_active.criticism.effects.effect import require_kind
 
     require_kind(effects)
-    if len(trials) < 2:
-        raise ValueError(
-            f"expected at least two trials to compare; got {len(trials)}; run more "
-            "trials first"
-        )
+    expected = "at least two trials to compare"
+    require(len(trials) >= 2, expected, len(trials), "run more trials first")
     if not isinstance(simulator, SimulatorModel):
         simulator = SimulatorModel(simulator)
     outcomes = [t.x for t in trials if t.x is not None]
@@ -84,20 +81,15 @@ def revise(state: CampaignState, actions: ActionSpace, report: Report) -> Learne
             f"expected a report; got {report!r:.80}; pass what criticize() returned"
         )
     chosen = report.tracing.chosen
-    if not chosen:
-        raise ValueError(
-            "expected a report whose verdict names effects; got the verdict "
-            f"{report.verdict!r}, which adds none; criticize(effects) with further "
-            "effects, or after further trials"
-        )
+    expected, got = "a report whose verdict names effects", repr(report.verdict)
+    advice = "criticize(effects) with further effects, or after further trials"
+    require(bool(chosen), expected, f"the verdict {got}, which adds none", advice)
     before = state.version
     added: Any = getattr(report.simulator, "effects", ())
     names = [e.name for e in added if e.scope == "campaign"]
-    if report.digest not in before.examined or names != [*before.effects, *chosen]:
-        raise ValueError(
-            f"expected a report of the current model, version {before.number}; got one "
-            "of another; criticize() again"
-        )
+    is_own = report.digest in before.examined and names == [*before.effects, *chosen]
+    expected = f"a report of the current model, version {before.number}"
+    require(is_own, expected, "one of another", "criticize() again")
     state.versions.append(
         ModelVersion(
             number=before.number + 1,

@@ -1,9 +1,9 @@
 """The folder of a campaign: what it is, what happened, and what follows from it.
 
 All is in one file, ``store.db``. What the campaign is never changes; what was asked,
-told and decided is only ever added to. From these two and the simulator all else can be
-computed again: the state and the belief save that work, and the rows of simulations the
-simulator's. ``campaign.toml`` says what the campaign is, for people alone.
+told and decided is only added to. Everything else can be computed from these two and
+the simulator: the stored state, belief and simulated rows only save that work.
+``campaign.toml`` describes the campaign for people and is never read.
 """
 
 from __future__ import annotations

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+from pandas.errors import EmptyDataError, ParserError
 
 from sbi_active.arrays import Array
 from sbi_active.criticism.data.columns import TIME, TRIAL, Column
@@ -170,9 +171,17 @@ def read_csv(path: Path) -> pd.DataFrame:
         with path.open(encoding="utf-8-sig", newline="") as file:
             # A "#" within a cell is a part of it: only whole lines are comments.
             lines = [line for line in file if not line.lstrip().startswith("#")]
+        first = next((line.strip() for line in lines if line.strip()), "")
+        require(
+            "," in first or not {*";\t"} & {*first},
+            "cells separated by commas",
+            f"{first!r} in {path}",
+            "save the table with commas and decimal points, or pass the frame "
+            "pandas.read_csv(path, sep=..., decimal=...)",
+        )
         options: Any = {"header": None, "dtype": str, "keep_default_na": False}
         table = pd.read_csv(io.StringIO("".join(lines)), **options)
-    except ValueError as error:  # of its bytes, or of its rows
+    except (UnicodeError, ParserError, EmptyDataError) as error:
         said = str(error).rpartition("error: ")[2].strip()
         raise ValueError(
             "expected text in UTF-8, names of columns, and rows of as many cells; got "
@@ -180,11 +189,4 @@ def read_csv(path: Path) -> pd.DataFrame:
             "a comma in quotes"
         ) from error
     header = [str(cell).strip() for cell in table.iloc[0]]
-    require(
-        len(header) > 1 or not {*";\t"} & {*header[0]},
-        "cells separated by commas",
-        f"{header[0]!r} in {path}",
-        "save the table with commas and decimal points, or pass Trials.from_dataframe("
-        "pandas.read_csv(path, sep=..., decimal=...))",
-    )
     return table.iloc[1:].set_axis(header, axis=1).reset_index(drop=True)

@@ -38,7 +38,7 @@ NUM_CHECKED, NUM_FIRST = 16, 3
 
 @dataclass(frozen=True)
 class _Rows:
-    """What effects do in rows: phi by effect, actions as commanded, conditions."""
+    """Effects in rows: phi by effect, actions as commanded, conditions."""
 
     phi: dict[str, Tensor]
     action: Tensor

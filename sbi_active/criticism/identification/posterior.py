@@ -44,7 +44,7 @@ class ChannelErrors:
     .. math::
         r_c(u) \sim \mathcal N(0, v_c\, C_{h_c})
 
-    Of several channels there are too many combinations to sum over. Given u, channels
+    Several channels have too many combinations to sum over. Given u, channels
     are independent, so that errors are drawn by what the residuals at some likely u say
     of each channel,
 

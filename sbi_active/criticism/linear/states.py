@@ -264,7 +264,7 @@ class States:
     def chi_square(self, key: ModelKey) -> tuple[float, float]:
         """Return a model's chi-square and its tail, by all that is declared.
 
-        Of effects on the noise it is the smallest among draws of their posterior. Where
+        With effects on the noise it is the least among draws of their posterior. Where
         the correlation of errors is declared it counts; where it is unknown, numbers
         count as independent.
 

@@ -1,4 +1,4 @@
-"""What speaks against a verdict: further trials, and a prior that is too narrow."""
+"""Evidence against a verdict: further trials, and a prior that is too narrow."""
 
 from __future__ import annotations
 
@@ -81,7 +81,7 @@ def _reported(
 ) -> dict[str, tuple[float, float]]:
     """Return the errors before and after that a verdict under misfit is told with.
 
-    Of several channels in sensor deviations.
+    Several channels are compared in sensor deviations.
     """
     bare, own = misfit.of(NONE), misfit.of(str(ModelKey(misfit.helps)))
     unit = misfit.sensor if len(misfit.sensor) > 1 else 1.0

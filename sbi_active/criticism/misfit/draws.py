@@ -134,7 +134,7 @@ def _linear(
     """Return a linear model with its draws as its posterior sample.
 
     Wide draws of what misses leave the valleys of what bends: trials are predicted from
-    the best fit. Beside a gross error, its trial tells little.
+    the best fit. A trial with a gross error tells little else.
 
     Args:
         found: Verdict with the model.

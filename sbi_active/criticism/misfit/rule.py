@@ -35,7 +35,7 @@ from mean squared residuals r of fits in sensor variances: of the set, of the se
 without the effect and of the bare model. w is one; where the set's errors are likeliest
 larger without structure, as those of a sensor that was declared too fine, it is what is
 white in its residual (:func:`.white_variance`), which no effect could leave out. In
-each state it would be too much: of samples that are far apart all looks white. What is
+each state it would be too much: samples that are far apart always look white. What is
 left out tells less of the error, since a few trials to which a fit extrapolates hold
 most of it. Neither number changes with the unit of x, the order of the effects, or
 others that explain nothing, and hardly with the declared size of the sensor's error:

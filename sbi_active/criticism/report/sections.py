@@ -26,7 +26,6 @@ from sbi_active.criticism.report.words import (
     stated,
     suspects_in_words,
     verdict_in_words,
-    with_error,
 )
 from sbi_active.criticism.results import NONE, ModelKey
 from sbi_active.criticism.steps.detection import LEVEL
@@ -34,6 +33,7 @@ from sbi_active.display.page import Page, Picture, Section
 from sbi_active.display.panels import plot_residuals, plot_scores
 from sbi_active.display.table import Table
 from sbi_active.messages import Message, place
+from sbi_active.plain import with_error
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -267,7 +267,7 @@ def _alike(left: list[tuple[Array, float]], local: list[bool]) -> Array:
 def _every_action(rivals: RivalSet, actions: ActionSpace) -> Trials:
     """Return the trials at hand and one of every permitted action, in random order.
 
-    Of a list that is longer, or a box, 48 actions stand for all.
+    A longer list, or a box, is represented by 48 actions.
     """
     values = actions.listed()
     if values is None or len(values) > 48:

@@ -103,7 +103,7 @@ def choose_estimator(
     posterior, nested Monte Carlo on a likelihood, or InfoNCE on a ratio, which no
     normalization of it can fool, but the mean log ratio where that is near its largest
     value. Without a model outcomes that may have no measurement by luck have densities
-    fitted to each candidate. Beside it, why others were not taken.
+    fitted to each candidate. Also returns why others were not used.
 
     Args:
         model: Model that was learned, or None.

@@ -111,7 +111,7 @@ class Evidence:
     ) -> tuple[Tensor, Tensor]:
         """Log terms of the sum of simulations and local draws, shape (i, n + l).
 
-        Beside them is the least that the evidences may be, shape (i,).
+        The second result is a lower bound of the evidences, shape (i,).
         """
         x = self.x[i]
         location, precision = self._linearized(x, slope, i)

@@ -175,7 +175,7 @@ def _information(theta: Tensor, y: Tensor) -> Tensor:
 def _off_plane(theta: Tensor, y: Tensor) -> tuple[Tensor, int]:
     """Return what of outcomes (n, N) no linear function of theta follows.
 
-    Beside it is the rank of the parameters (n, d).
+    Also returns the rank of the parameters (n, d).
     """
     apart, off = (theta - theta.mean(0)) / theta.std(0).clamp(min=1e-300), y - y.mean(0)
     basis, values, _ = torch.linalg.svd(apart, full_matrices=False)

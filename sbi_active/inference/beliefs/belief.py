@@ -17,6 +17,7 @@ from sbi_active.display.notebook import card, table
 from sbi_active.display.table import Table
 from sbi_active.inference.beliefs.diagnostics import Diagnostics
 from sbi_active.messages import warn
+from sbi_active.plain import with_error
 from sbi_active.seeding import forked_generators
 from sbi_active.support import parameter_dim, support_of, within_support
 
@@ -143,7 +144,7 @@ class Belief(Distribution, ABC):
         mean, sd = self.mean.tolist(), self.variance.sqrt().tolist()
         names = [f"{name} " for name in self.parameter_names or ()] or [""] * len(mean)
         rows = zip(names, mean, sd, strict=True)
-        cells = [f"{name}{m:.3g} +- {s:.2g}" for name, m, s in rows]
+        cells = [f"{name}{with_error(m, s)}" for name, m, s in rows]
         return f"{type(self).__name__}({self.label}: {', '.join(cells)})"
 
     def _repr_html_(self) -> str:

@@ -48,9 +48,9 @@ def require_support(
     except (NotImplementedError, AttributeError):
         support = None
     require(
-        support is not None,
+        support is not None and hasattr(prior, "event_shape"),
         "a prior with a support, which every belief keeps",
-        f"{name} without one",
+        f"{name}",
         "use sbi.utils.BoxUniform, a torch distribution, or sbi.utils.process_prior "
         "with lower_bound and upper_bound",
     )
@@ -142,6 +142,9 @@ def require_width(
         f"{draws[0].tolist()} outside",
         "pass finite bounds, the lower one below the upper one",
     )
+    is_named = names is None or len(names) == len({*names}) == draws.shape[1]
+    each = f"a different name for each of {draws.shape[1]} parameters"
+    require(is_named, each, names, "give one each")
     draws = draws.double()
     size = draws.abs().amax(0).clamp_min(torch.finfo(torch.float32).tiny)
     steps = draws.std(0) / (size * torch.finfo(torch.float32).eps)

@@ -166,8 +166,8 @@ def _beyond_noise(
 ) -> bool:
     """Return whether the noise is never as unlikely as the trials, heavy tails too.
 
-    Of parameters (n, d) those count at which the trials are likeliest: least squares
-    do not find them where tails are heavy.
+    Uses the most likely of the parameters (n, d), which least squares do not find
+    where tails are heavy.
     """
     log_likelihood = likelihood(theta)
     best = int(log_likelihood.argmax())

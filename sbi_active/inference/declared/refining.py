@@ -190,7 +190,7 @@ def refine_declared(problem: Problem, past: object) -> SimulatedBelief | None:
     potential = SimulatedPotential(declared, coordinates)
     near = _near(problem.hints, coordinates, seed)
     first = None if near is None else near[:2]
-    found = search(potential, rng, first, own.search, screened=screened)
+    found = search(potential, rng, first, own.search, screened=screened, believed=near)
     if found is not None:
         screened = found.screened[: own.search.num_screened]
     potential, found, contradiction = _inflated(potential, found, own, rng)

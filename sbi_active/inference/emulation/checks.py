@@ -87,7 +87,7 @@ def predicted_tails(
 
 @dataclass(frozen=True)
 class Fresh:
-    """What simulations that no regression was fitted to say of it.
+    """A regression's error on simulations that it was not fitted to.
 
     Attributes:
         tails: Tail probability of each trial and, last, of all.

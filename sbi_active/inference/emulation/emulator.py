@@ -94,7 +94,7 @@ class Interpolation:
     def hoped(self, z: Array) -> Array:
         """Return log densities of what is nearest to the observed numbers, (n,).
 
-        Within as many deviations as the process misses a left-out row by.
+        They span as many deviations as the process misses a left-out row by.
         """
         mean, variance = self.predict(z)
         off = self.process.left_out_most * np.sqrt(variance)

@@ -9,9 +9,9 @@ trials fall off is information. The likelihood of a trial is that of what happen
     P(F_k | \theta)\, p(x_{F_k} | \theta, F_k) & \text{with the numbers } F_k,
     \end{cases}
 
-where :math:`F_k` stands for "these numbers, and perhaps others, are present". What the
-absence of others tells beyond that is left out: the posterior is of a part of the
-data, so it can be wider than it could be but is not biased.
+where :math:`F_k` stands for "these numbers, and perhaps others, are present". The
+information in the absence of others is left out: the posterior uses a part of the data,
+so it may be too wide but is not biased.
 
 The probabilities are logistic regressions in a region's coordinates,
 

@@ -56,7 +56,7 @@ def refine(
     Where the simulator is noise-free beside a declared noise, a simulation gives the
     likelihood itself, and the posterior is sampled with that (:func:`.infer`).
 
-    Of any other simulator it is learned, stage by stage, over the whole prior and then
+    For any other simulator it is learned in stages, over the whole prior and then
     where it is still plausible: simulate every executed action, regress the outcomes on
     the parameters (:mod:`.regression`), sample prior times learned likelihood without
     simulations (:func:`.learned_fit`), and simulate where the sample lies. It ends when

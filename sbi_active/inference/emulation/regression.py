@@ -333,8 +333,8 @@ def _excess(
     The mean over outcomes is sharp where all are missed a little, and counts as often
     as there are outcomes; the maximum is where one is missed. Each is less what chance
     alone reaches, but for ``chance``: ratios are F distributed and correlate as the
-    squares of the residuals' correlations. Of more than ``numbers``, less misfit of
-    each is as bad, since what is missed is smooth and adds up: 3 % of the variance of
+    squares of the residuals' correlations. With more than ``numbers``, a smaller misfit
+    of each is as bad, since smooth misfits add up: 3 % of the variance of
     1,000 numbers moved a mean by .8 deviations. At 20 the largest shift of four seeds
     is .25, at 10 .44 and at 40 .20.
     """

@@ -6,8 +6,8 @@ References:
 
 Noise that is not Gaussian: residuals as a mixture, of a size that may grow.
 
-Beside the Gaussian likelihood of a regression stands another, of the same prediction m
-and its residuals,
+A second likelihood of a regression is not Gaussian. It uses the same prediction m and
+its residuals,
 
 .. math::
     e_j = \frac{x_j - m_j(\theta)}{c_j\, s_j(\theta)}, \qquad

@@ -224,7 +224,7 @@ def best_solved(
 ) -> tuple[Solved, Solved]:
     """Return the polynomial that predicts left-out rows near the belief best.
 
-    Beside it cosines, where these do better.
+    Adds cosines where these do better.
 
     Args:
         region: Region of the belief.

@@ -1,7 +1,7 @@
 """Narrow proposals along the ridges of a posterior.
 
-Of two parameters that the trials know by their product alone, a posterior is as narrow
-across a curved ridge as the trials are precise, and as long as the prior. Its width
+If trials determine only the product of two parameters, the posterior is a curved ridge,
+as narrow as the trials are precise and as long as the prior. Its width
 over its radius of curvature says how short a normal density has to be to stay on it,
 so that there are many: some are led to the ridge by least squares, and the others lie
 where draws of these count.

@@ -98,6 +98,7 @@ def search(
     settings: SearchSettings = SearchSettings(),  # noqa: B008  (frozen)
     *,
     screened: Array | None = None,
+    believed: Array | None = None,
 ) -> Found | None:
     r"""Return normal approximations at the modes; None if no search gets anywhere.
 
@@ -115,6 +116,9 @@ def search(
         near: Places to begin at as well, shape (k, d).
         settings: Numbers of searches.
         screened: Draws of the prior to look at first, shape (n, d); None draws them.
+        believed: Draws of an earlier belief, shape (m, d), the best of which begin
+            searches where the first do not suffice: where the response jumps, a single
+            draw may begin on the wrong side.
 
     References:
         Boender & Rinnooy Kan, Mathematical Programming 37 (1987).
@@ -136,6 +140,10 @@ def search(
             starts = starts[np.argsort(cost)[: own.num_starts]]
         if near is not None and num == 0:
             starts = np.concatenate([start_at(near), starts])
+        if believed is not None and len(looked) == 2:
+            likely = start_at(believed)
+            best = np.argsort(_cost(problem, likely, whiten))[: own.num_kept]
+            starts = np.concatenate([likely[best], starts])
         num += len(starts)
         ends, _ = descend(problem, starts, whiten, problem.step, own.iterations)
         u = np.concatenate([u, ends])
@@ -199,7 +207,7 @@ def _settled(
 ) -> tuple[Array, Array, Whitener]:
     """Return places, their cost, and the error that the best makes most probable.
 
-    Beyond a sum of squares of ``far`` a number, a place is far from a fit.
+    A place is far from a fit if its mean square exceeds ``far``.
     """
     own, u, cost, stalls = settings, u.copy(), _cost(problem, u, whiten), 0
     for _ in range(own.phases):

@@ -124,9 +124,9 @@ class Settings:
         hopeless: Such a share with which importance sampling is not tried: of 15
             uniform parameters, told by eight sums, it took 40 s in vain.
         num_ridge: Places along a ridge, beside draws that are known, and draws that
-            count as further ones of each proposal. Of two parameters that are known by
-            their product to 1e-4, a quarter leaves gaps of 6 % of the evidence, half of
-            2 %, and twice as many save no rows.
+            count as further ones of each proposal. If only the product of two
+            parameters is known, to 1e-4, a quarter leaves gaps of 6 % of the evidence,
+            half leaves 2 %, and twice as many save no rows.
         num_ridged: Proposals along ridges before others are tried as well; then those
             that were the more efficient go on.
         idle: Share of its part of the draws below which a place is left out. Half and

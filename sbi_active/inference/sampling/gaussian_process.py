@@ -72,8 +72,8 @@ class GaussianProcess:
     last, and the hyperparameters at their most probable values. Noise is none, learned,
     or known but for a factor below one: values from common random numbers err together,
     which a smooth function absorbs. Unless it is known the variance is scaled so that
-    left-out rows are missed by as much as it says. Of outputs without noise a
-    least-squares trend is taken off first: they may differ by 10,000 deviations of the
+    left-out rows are missed by as much as it says. If outputs have no noise, a
+    least-squares trend is subtracted first: they may differ by 10,000 deviations of the
     noise declared beside them, and are to be known to one.
 
     Attributes:

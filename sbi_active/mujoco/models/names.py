@@ -89,7 +89,7 @@ def start_places(model: Any) -> dict[str, int]:
 def places_of(model: Any) -> dict[str, int]:
     """Return places of all that a trial may set, by name.
 
-    Behind the physics state of :func:`start_places` stands what is held: controls,
+    The physics state of :func:`start_places` is followed by what is held: controls,
     "motor control", and the poses of mocap bodies, "target mocap[0]" to
     "target mocap[6]", a position and a quaternion.
     """

@@ -249,7 +249,7 @@ def find_quantity(model: Any, text: str) -> Quantity:
         if (q.name, q.attribute) == (name, attribute) and wanted in ("", q.kind)
     ]
     if not dot or not found:
-        require_name(rest, map(str, every), "quantity, 'element.attribute',")
+        require_name(rest, map(str, every), "quantity 'element.attribute'")
     kinds = ", ".join(f"{q.kind}:{q}" for q in found)
     expected, advice = f"one quantity {text!r}", f"pass one of {kinds}"
     require(len(found) == 1, expected, len(found), advice)

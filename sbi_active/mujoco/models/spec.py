@@ -7,6 +7,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from sbi_active.expected import require
+
 try:
     import mujoco as mujoco_module
     import mujoco.rollout
@@ -68,6 +70,8 @@ class Source:
             self._text = given
         else:
             self._path = Path(given).resolve()
+            got = f"none at {self._path}"
+            require(self._path.is_file(), "an MJCF file", got, "check the path")
         self.compile()
         if self._spec is not None:
             self._text, self._assets = self._spec.to_xml(), dict(self._spec.assets)

@@ -1,13 +1,11 @@
 """A store of sealed records in a folder: of banks and of campaigns.
 
-It is one SQLite file, which may come from anybody: nothing in it is executed. Its table
-is compared with that of a store before anything is read from it, no journal is played
-back that none leaves, and no link is followed.
+It is one SQLite file, which may come from anybody: nothing in it is executed, its table
+is checked before anything is read, and no foreign journal or link is followed.
 
-A record has a kind, a number and a content. Records of a series are numbered from 1,
-and a catalog says which there are. Checksums cover kind, number and the file's own
-name, so that bytes that were changed, exchanged, lost or come from elsewhere are
-noticed: SQLite itself has checksums of its log alone.
+A record has a kind, a number and a content. A catalog lists the records of a series,
+which are numbered from 1. Checksums cover all three and the file's own name, since
+SQLite has checksums of its log alone.
 """
 
 from __future__ import annotations
@@ -32,7 +30,7 @@ from sbi_active.expected import require
 from sbi_active.messages import Explained
 
 NAME, FORMAT = "store.db", 4  # format 1 was folders of HDF5
-#: Of two files: an empty one, on which who writes holds SQLite's lock, and one begun.
+#: Names of an empty file that a writer locks, and of a file that is being written.
 LOCK, TEMPORARY = "store.lock", ".writing-"
 CATALOG = "catalog"  # the last number of each kind
 #: The digest stands before the content, whose pages are then read only for it.
@@ -51,7 +49,7 @@ SETTINGS = (
 )
 #: Seconds to wait for a moment in which another process tidies up. A choice.
 PATIENCE = 10.0
-OTHERWISE = "or bring what is there from before up to date by: sbi-active migrate"
+OTHERWISE = "or update a folder of release 0.1: sbi-active migrate DIR"
 #: SQLite's errors that say nothing against the file.
 OF_THE_DISK = re.compile("locked|full|readonly|disk I/O|unable to open|too big")
 
@@ -111,7 +109,7 @@ _STORES: weakref.WeakSet[Store] = weakref.WeakSet()
 class Store:
     """A file of records in a folder. Any number of processes read, and one writes.
 
-    Who reads has the file open for a look alone; who writes, until it is closed.
+    Readers open the file for each read; a writer keeps it open until it is closed.
 
     Args:
         folder: Folder that has or gets the file.
@@ -123,10 +121,8 @@ class Store:
         path: The file.
 
     Raises:
-        ValueError: If there is none and none is to be made, the folder holds anything
-            else, or a store of another format.
-        CorruptSegmentError: Here and wherever records are read, if the file does not
-            hold what was written.
+        ValueError: If there is none to open, or the folder holds anything else.
+        CorruptSegmentError: If the file does not hold what was written; reads raise it.
     """
 
     def __init__(self, folder: Path, what: str = "bank", *, make: bool = False) -> None:
@@ -280,7 +276,11 @@ class Store:
     def _make(self) -> None:
         """Make the file in a folder of its own, which is made where there is none."""
         folder, known = self.folder, (".", NAME, LOCK)  # of writers that were killed
-        folder.mkdir(parents=True, exist_ok=True)
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            error.strerror = f"expected a folder; got {error.strerror}; choose another"
+            raise
         other = sorted(p.name for p in folder.iterdir() if not p.name.startswith(known))
         expected, got = f"an empty folder for a {self._what}", f"{folder} with {other}"
         require(not other, expected, got, f"choose another folder, {OTHERWISE}")
@@ -297,11 +297,10 @@ class Store:
 
     def _open(self) -> None:
         """Open the file, whose table must be that of a store."""
-        path, make = self.path, "give simulator= or directory=, or run sbi-active init"
-        advice = f"{make}, to make one, {OTHERWISE}"
+        path, advice = self.path, f"check the path, make a {self._what}, {OTHERWISE}"
         require(os.path.lexists(path), f"a {self._what}", f"no {path}", advice)
-        # Where no notes of a reader can be written, or would be another user's and keep
-        # the owner from writing, the file is read as it is.
+        # Where a reader's notes cannot be written, or would keep the owner from
+        # writing, the file is read as it is.
         is_still = not all(os.access(p, os.W_OK) for p in (path, path.parent))
         is_still &= not path.with_name(f"{NAME}-wal").exists()
         mode = "ro&immutable=1" if is_still else "rw"

@@ -1,4 +1,4 @@
-"""What becomes of simulated rows: counted for a campaign, and kept in a store."""
+"""Simulated rows: counted for a campaign, and kept in a store."""
 
 from __future__ import annotations
 

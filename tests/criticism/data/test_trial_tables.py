@@ -91,6 +91,7 @@ BAD = [
     (f"{SHORT},role|1,0,1,5,|3,0,1,6,test", "role, row 2 .*; got test in trials"),
     (f"{SHORT},index|1,0,1,5,3|2,0,1,4,3", "got index 3 in trials 1 and 2"),
     (f"{SHORT}|1,0,1,5".replace(",", "\t"), "separated by commas; got .*sep="),
+    ("trial;action_v;x_y|1;1,5;0,2|2;2,5;0,4", "separated by commas; got 'trial;a"),
     (f"{SHORT}|1,0,5,1,5,2", "got 'Expected 4 fields in line 2, saw 6' in tr"),
     ("", "names of columns, .* got 'No columns .* in trials.csv"),
     (f"{SHORT}|1,0,1,", "at least one valid trial"),

@@ -4,6 +4,7 @@ import json
 import math
 
 import pytest
+import scipy.stats
 import torch
 from sbi.utils import BoxUniform, MultipleIndependent
 from sbi.utils.torchutils import set_validate_args
@@ -165,6 +166,7 @@ def independent(prior: Distribution) -> Independent:
         (independent(Poisson(3 * TWO)), "continuous parameters; got a discrete one"),
         (independent(Bernoulli(0.5 * TWO)), "declare the choice as an Effect"),
         (Dirichlet(TWO), "may vary one by one; got Dirichlet"),
+        (scipy.stats.uniform(), "with a support, .*; got rv_continuous_frozen"),
         (Normal(0.0, 1.0), r"event shape \(theta_dim,\); got Normal"),
     ],
 )
@@ -173,6 +175,18 @@ def test_what_is_discrete_or_tied_is_refused(prior, message):
         require_support(prior)
     with pytest.raises(ValueError, match=message):
         campaign(prior)
+
+
+@pytest.mark.parametrize("names", [["mass"], ["mass", "mass"]])
+def test_each_parameter_has_a_name_of_its_own(names):
+    model = SimulatorModel(
+        lambda theta, action: theta * action,
+        noise=GaussianNoise(0.1),
+        parameter_names=names,
+    )
+    prior = BoxUniform(torch.zeros(2), torch.ones(2))
+    with pytest.raises(ValueError, match="a different name for each of 2 parameters"):
+        Campaign(model, prior, BoxActions([0.0], [1.0]))
 
 
 def test_draws_that_repeat_are_refused():

@@ -150,6 +150,29 @@ def test_searches_that_agree_on_a_wrong_place_go_on():
     assert float(best[0]) > float(likelihood(truth)[0]) - 3
 
 
+def test_an_earlier_belief_finds_the_way_back_between_jumps():
+    # Only within 5e-4 of the truth does the response not jump.
+    def jagged(theta, action):
+        jump = torch.sin(12_345 * torch.floor(theta / 1e-3)) * (theta.abs() > 5e-4)
+        return torch.cat([theta + jump, 2 * theta - jump**2], 1)
+
+    table = MeanTable(SimulatorModel(jagged, noise=GaussianNoise(1e-3)), IN_PROCESS)
+    x = torch.zeros(1, 2, dtype=torch.float64)
+    likelihood = SimulatedLikelihood(table, torch.zeros(1, 1), x)
+    rng = np.random.default_rng(0)
+    c = NormalCoordinates(PriorCoordinates(PRIOR, rng), rng)
+    potential = SimulatedPotential(likelihood, c)
+    believed = np.random.default_rng(1).normal(0, 3e-4, (250, 1))
+    believed[0] = 2e-3  # the only one of them at which the search begins at once
+    off = []
+    for known in (None, believed):
+        rng = np.random.default_rng(0)
+        found = search(potential, rng, believed[:1], believed=known)
+        assert found is not None
+        off.append(float(c.to_theta(found.modes[:1]).abs()))
+    assert off[1] < 1e-3 < off[0]
+
+
 @pytest.mark.parametrize("off", [0.0, 8.0])
 def test_a_prior_far_from_the_trials_is_weighed(off: float):
     # Each of ten parameters is told by the sum of its numbers; the likelihood is as

@@ -73,9 +73,12 @@ def test_other_formats_and_folders(bank, tmp_path):
     execute(bank.path, "PRAGMA user_version = 99")
     with pytest.raises(ValueError, match="expected a bank of format 4; got 99"):
         Bank(bank.path)
-    with pytest.raises(ValueError, match=r"got no .*store.db; give simulator="):
+    with pytest.raises(ValueError, match=r"got no .*store.db; check the path"):
         Bank(tmp_path / "none")
     assert not (tmp_path / "none").exists()
+    (tmp_path / "notes").touch()
+    with pytest.raises(OSError, match="expected a folder; got .*; choose another"):
+        Bank(tmp_path / "notes" / "bank", simulator=simulator)
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "thesis.tex").touch()
     with pytest.raises(ValueError, match=r"an empty folder .* with \['thesis.tex'\]"):
