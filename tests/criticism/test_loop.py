@@ -13,7 +13,7 @@ from sbi_active.criticism import (
     Trials,
     close_loop,
 )
-from tests.effects import BIAS, effect, normal, on_outcomes
+from tests.effects import BIAS, drift, effect, gain, normal
 
 PRIOR = BoxUniform(-3 * torch.ones(2), 3 * torch.ones(2))
 ACTIONS = DiscreteActions(torch.linspace(-2, 2, 17))
@@ -29,10 +29,7 @@ MODEL = SimulatorModel(response, noise=GaussianNoise(NOISE), parameter_names=["a
 
 
 CUBIC = Effect.keyword("cubic", prior=normal(0.5))
-DRIFT = on_outcomes(
-    "drift", lambda x, phi, action, context: x + phi * context.index[:, None], sd=0.2
-)
-GAIN = on_outcomes("gain", lambda x, phi, action, context: x * (1 + phi), sd=0.3)
+DRIFT, GAIN = drift(0.2), gain(0.3)
 LIBRARY = [BIAS, CUBIC, DRIFT, GAIN]
 
 

@@ -5,30 +5,17 @@ import torch
 from attrs import evolve
 from sbi.utils import BoxUniform
 
-from sbi_active import (
-    Campaign,
-    DiscreteActions,
-    GaussianNoise,
-    SimulatorModel,
-    StopRules,
-)
+from sbi_active import Campaign, DiscreteActions, StopRules
 from sbi_active.campaign.learning.planner import most_unlike
 from sbi_active.campaign.options import CampaignDetails
 from tests.campaign import problem
-from tests.effects import BIAS, on_outcomes
+from tests.campaign.problem import MODEL
+from tests.effects import BIAS, drift
 
 PRIOR = BoxUniform(-2 * torch.ones(1), 2 * torch.ones(1))
 ACTIONS = DiscreteActions([-2.0, -1.0, 1.0, 2.0])
-MODEL = SimulatorModel(lambda theta, action: theta * action, noise=GaussianNoise(0.1))
 OPTIONS = evolve(problem.OPTIONS, details=CampaignDetails(num_scored=400))
-SHIFT = 0.8
-
-
-def drifting(x, phi, action, context):
-    return x + phi * context.index[:, None]
-
-
-LIBRARY = [BIAS, on_outcomes("drift", drifting)]
+SHIFT, LIBRARY = 0.8, [BIAS, drift()]
 
 
 def campaign(effects=(BIAS,), method="asbi", *, constraint=None, **changes):

@@ -6,7 +6,7 @@ import torch
 from sbi.utils import BoxUniform
 from torch.distributions import HalfNormal, LogNormal, Normal, Uniform
 
-from sbi_active import Campaign, DiscreteActions, GaussianNoise, SimulatorModel
+from sbi_active import Campaign, DiscreteActions, SimulatorModel
 from sbi_active.criticism import (
     AugmentedSimulator,
     Criticism,
@@ -15,13 +15,12 @@ from sbi_active.criticism import (
     joint_prior,
 )
 from sbi_active.criticism.effects.effect import require_nested
+from tests.criticism.slope_world import MODEL, PRIOR
 from tests.effects import effect
 
 NAN, NORMAL = float("nan"), Normal(0.0, 1.0)
-PRIOR = BoxUniform(-3 * torch.ones(1), 3 * torch.ones(1))
 SPEED = torch.tensor([1.0, 2.0, 3.0, 2.0, 1.5])
 STOP = 0.7 * SPEED + 0.1 * torch.tensor([0.3, -1.2, 0.8, 0.1, -0.4])
-MODEL = SimulatorModel(lambda theta, xi: theta * xi, noise=GaussianNoise(0.1))
 ACTIONS = DiscreteActions([1.0, 1.5, 2.0, 3.0])
 
 

@@ -14,7 +14,7 @@ from sbi_active.criticism import (
     joint_prior,
 )
 from sbi_active.simulation import simulate
-from tests.effects import effect
+from tests.effects import drift, effect
 
 PRIOR = BoxUniform(-torch.ones(2), torch.ones(2))
 ACTIONS = DiscreteActions(torch.linspace(-2, 2, 9))
@@ -103,8 +103,7 @@ def test_a_null_at_infinity():
 
 
 def test_the_index_of_a_plain_call_is_the_next_trial():
-    drift = effect("drift", apply=lambda x, phi, a, c: x + phi * c.index[:, None])
-    model = AugmentedSimulator(MODEL, [drift], next_index=8)
+    model = AugmentedSimulator(MODEL, [drift()], next_index=8)
     x = model.mean(torch.tensor([[0.0, 0.0, 0.5]]), torch.zeros(1, 1))
     assert x.item() == pytest.approx(4.0)
     given = torch.zeros(3, 2), {"drift": torch.ones(3, 1)}, torch.zeros(3, 1)

@@ -6,9 +6,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from sbi.utils import BoxUniform
 
-from sbi_active import DiscreteActions, GaussianNoise, SimulatorModel
+from sbi_active import DiscreteActions
 from sbi_active.criticism import Criticism, Trials, close_loop
 from sbi_active.criticism.experiments.choice import (
     limit_of,
@@ -18,15 +17,11 @@ from sbi_active.criticism.experiments.choice import (
 from sbi_active.criticism.experiments.settle import NAME, VerdictError, settle
 from sbi_active.criticism.misfit.rule import Rule
 from tests.criticism.misfit import oscillator
+from tests.criticism.slope_world import MODEL, NOISE, PRIOR, read
 from tests.effects import added
 
 pytestmark = pytest.mark.usefixtures("few_draws")
 
-NOISE = 0.1
-PRIOR = BoxUniform(-3 * torch.ones(1), 3 * torch.ones(1))
-MODEL = SimulatorModel(
-    lambda theta, xi: theta * xi + 0 * xi, noise=GaussianNoise(NOISE)
-)
 #: Trials so far were all forward; the robot may go back as well.
 FORWARD = torch.tensor([1.0, 1.5, 2.0, 2.5, 3.0, 1.0, 2.0, 3.0])[:, None]
 BOTH = DiscreteActions([-3.0, -1.0, 1.0, 3.0])
@@ -49,7 +44,7 @@ class Robot:
         return self.read(action[None])[0]
 
     def read(self, action):
-        x = 0.7 * action + NOISE * torch.randn(action.shape, generator=self.gen)
+        x = read(0.7 * action, self.gen)
         return x if self.form is None else x + self.size * self.form(action)
 
     def trials(self):

@@ -14,7 +14,7 @@ from sbi_active.criticism.linear.search import Search
 from sbi_active.criticism.results import ModelKey
 from sbi_active.criticism.steps import equivalence
 from sbi_active.criticism.steps.detection import log_priors
-from tests.effects import louder, on_outcomes
+from tests.effects import drift, louder, on_outcomes
 
 SENSOR, NUM_TRIALS, LIMIT, SLOPE = 0.5, 14, 14.0, 2.0
 
@@ -31,7 +31,7 @@ EFFECTS = [
         prior=Independent(Uniform(torch.tensor([0.0]), torch.tensor([4.0])), 1),
         null=torch.inf,
     ),
-    on_outcomes("drift", lambda x, phi, action, c: x + phi * c.index[:, None]),
+    drift(),
 ]
 
 

@@ -12,6 +12,7 @@ from sbi_active.criticism import Criticism, Trials
 from sbi_active.criticism.forces import force_effects
 from sbi_active.criticism.results import SCATTER, UNEXPLAINED, ModelKey
 from sbi_active.criticism.steps.detection import REFUTED
+from tests.criticism import slope_world
 from tests.criticism.forces.test_forces import MODEL, PRIOR, SD, measured
 from tests.criticism.misfit.oscillator import EFFECTS, SENSOR, TIMES, oscillate
 from tests.criticism.misfit.oscillator import MODEL as OSCILLATOR
@@ -108,10 +109,9 @@ def scattered(size, *effects, num=16, seed=1):
     action = torch.linspace(-2, 2, num, dtype=torch.float64)[:, None]
     draws = torch.Generator().manual_seed(seed)
     error = torch.randn(num, 1, generator=draws, dtype=torch.float64)
-    model = SimulatorModel(lambda theta, xi: theta * xi, noise=GaussianNoise(0.1))
-    prior = BoxUniform(-5 * torch.ones(1), 5 * torch.ones(1))
     trials = Trials(action, action + size(action) * error)
-    return Criticism(model, prior, trials, effects=effects, seed=0)
+    given = slope_world.MODEL, slope_world.PRIOR, trials
+    return Criticism(*given, effects=effects, seed=0)
 
 
 LOUDER = louder(lambda phi, action: phi[:, :1] * action.abs(), 2.0)

@@ -5,39 +5,26 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from sbi.utils import BoxUniform
 from scipy.stats import entropy
 
-from sbi_active import DiscreteActions, GaussianNoise, SimulatorModel
+from sbi_active import DiscreteActions
 from sbi_active.criticism import Criticism, Trials, next_action
-from sbi_active.criticism.next_action import (
-    PredictedRival,
-    beyond_range,
-    choose_action,
-)
+from sbi_active.criticism.next_action import beyond_range, choose_action
 from sbi_active.criticism.results import ModelKey
 from tests.criticism.misfit.oscillator import ACTION, EFFECTS, trials
 from tests.criticism.misfit.oscillator import MODEL as OSCILLATOR
 from tests.criticism.misfit.oscillator import PRIOR as RATES
-from tests.effects import on_outcomes
+from tests.criticism.slope_world import MODEL, NOISE, PRIOR, read
+from tests.effects import added, gain
 
-NOISE = 0.1
-PRIOR = BoxUniform(-3 * torch.ones(1), 3 * torch.ones(1))
 FORWARD = DiscreteActions([1.0, 2.0, 3.0])
 BOTH = DiscreteActions([-3.0, -1.0, 1.0, 3.0])
-MODEL = SimulatorModel(lambda theta, xi: theta * xi, noise=GaussianNoise(NOISE))
-
-
 #: Forward, a slope by distance is a slope.
-TILT = on_outcomes("tilt", lambda x, phi, action, context: x + phi * action.abs())
-GAIN = on_outcomes("gain", lambda x, phi, action, context: x * (1 + phi))
+TILT = added("tilt", torch.abs)
 
 
 def criticism(action, x, effects, actions):
-    gen = torch.Generator().manual_seed(0)
-    action = torch.tensor(action)
-    x = torch.as_tensor(x) + NOISE * torch.randn(len(action), generator=gen)
-    trials = Trials(action, x)
+    trials = Trials(action, read(x))
     return Criticism(MODEL, PRIOR, trials, effects=effects, actions=actions, seed=0)
 
 
@@ -52,7 +39,7 @@ def test_rivals_predict_their_posterior_predictive():
     action = torch.tensor([1.0, 2.0, 3.0, 2.0])
     c = criticism(action.tolist(), 0.7 * action, [], FORWARD)
     c.trace()
-    rival = PredictedRival(c.rivals, ModelKey(), 0.5, FORWARD.values)
+    rival = next_action.PredictedRival(c.rivals, ModelKey(), 0.5, FORWARD.values)
     x, *_ = rival.predict(torch.tensor([2.0]), 4_000, 3)
     assert x.shape == (4_000, 1)
     assert torch.equal(x, rival.predict(torch.tensor([2.0]), 4_000, 3)[0])
@@ -88,7 +75,7 @@ def test_the_other_way_separates_a_tilt():
 
 def test_where_no_action_separates_none_is_named():
     action = [-3.0, 2.0, 3.0, -2.0]
-    c = criticism(action, 0.7 * torch.tensor(action), [GAIN], BOTH)
+    c = criticism(action, 0.7 * torch.tensor(action), [gain()], BOTH)
     assert frozenset({"none", "gain"}) in c.trace().equivalent
     chosen = choose_action(c.rivals, only(c, "none", "gain"), BOTH)
     assert chosen.action is None

@@ -9,6 +9,7 @@ from sbi_active import DiscreteActions, GaussianNoise, SimulatorModel
 from sbi_active.criticism import Criticism, Trials, generic_effects
 from sbi_active.criticism.next_action import beyond_range, following, severe_tests
 from sbi_active.criticism.steps.predictive import predict
+from tests.criticism import slope_world
 from tests.effects import BIAS
 
 NOISE = 0.01
@@ -82,14 +83,11 @@ SPEEDS = DiscreteActions([1.0, 1.5, 2.0, 2.5, 3.0])
 
 def line(bias, fn=lambda theta, xi: theta * xi):
     """Return a loop with its severe tests."""
-    model = SimulatorModel(fn, noise=GaussianNoise(0.1))
     action = torch.tensor([1.0, 2.0, 3.0, 2.0, 1.5])
-    noise = 0.1 * torch.randn(5, generator=torch.Generator().manual_seed(0))
-    prior = BoxUniform(-3 * torch.ones(1), 3 * torch.ones(1))
-    trials = Trials(action, 0.7 * action + bias + noise)
-    c = Criticism(model, prior, trials, effects=[BIAS], actions=SPEEDS)
-    tracing = c.trace()
-    return c, severe_tests(c.rivals, tracing, SPEEDS)
+    trials = Trials(action, slope_world.read(0.7 * action + bias))
+    parts = slope_world.model(fn), slope_world.PRIOR, trials
+    c = Criticism(*parts, effects=[BIAS], actions=SPEEDS)
+    return c, severe_tests(c.rivals, c.trace(), SPEEDS)
 
 
 def forward(theta, xi):

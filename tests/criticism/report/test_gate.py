@@ -10,15 +10,9 @@ from sbi_active import DiscreteActions, GaussianNoise, SimulatorModel
 from sbi_active.criticism import Trials, close_loop, generic_effects
 from sbi_active.criticism.report.gate import EXIT_CODES
 from tests.criticism import block
+from tests.criticism.slope_world import MODEL, NOISE, PRIOR, read
 from tests.effects import BIAS
 
-NOISE = 0.1
-PRIOR = BoxUniform(-3 * torch.ones(1), 3 * torch.ones(1))
-MODEL = SimulatorModel(
-    lambda theta, xi: theta * xi + 0 * xi,
-    noise=GaussianNoise(NOISE),
-    parameter_names=["slope"],
-)
 ACTIONS = DiscreteActions(torch.linspace(-2, 2, 9))
 
 
@@ -28,8 +22,9 @@ def decided(form, *, prior=PRIOR, fitted=9, held_out=4):
     num = fitted + held_out
     action = ACTIONS.values[torch.randperm(9, generator=gen).repeat(2)[:num]]
     mean = form(action, torch.arange(num)[:, None] < fitted)
-    x = mean + NOISE * torch.randn(mean.shape, generator=gen)
-    trials = Trials(action, x, role=["fit"] * fitted + ["held out"] * held_out)
+    trials = Trials(
+        action, read(mean, gen), role=["fit"] * fitted + ["held out"] * held_out
+    )
     report = close_loop(MODEL, prior, trials, effects=[BIAS], plan=False)
     assert report.to_dict()["gate"] == json.loads(json.dumps(report.gate.to_dict()))
     assert report.gate.exit_code == EXIT_CODES[report.gate.decision]
@@ -61,11 +56,11 @@ CASES = {
     "a positive parameter": (
         lambda xi, fits: 0.1 * xi,
         {"prior": BoxUniform(torch.tensor([0.5]), torch.tensor([3.0]))},
-        *("OUT_OF_PRIOR", lambda own: 0 < own["box"]["slope"]["lower"] < 0.1),
+        *("OUT_OF_PRIOR", lambda own: 0 < own["box"]["theta_1"]["lower"] < 0.1),
     ),
     "a truth beyond a bound, which is to be moved": (
         lambda xi, fits: 4.0 * xi,
-        *({}, "OUT_OF_PRIOR", lambda own: 4.0 < own["box"]["slope"]["upper"] < 6.0),
+        *({}, "OUT_OF_PRIOR", lambda own: 4.0 < own["box"]["theta_1"]["upper"] < 6.0),
     ),
     "few trials": (
         lambda xi, fits: 0.7 * xi,
@@ -82,7 +77,7 @@ def test_a_decision_has_its_details(case):
     assert holds(gate.details)
     for bound in gate.details.get("bounds", ()):
         where = (bound["name"], bound["side"], bound["bound"])
-        assert where in [("slope", "upper", 3.0), ("slope", "lower", 0.5)]
+        assert where in [("theta_1", "upper", 3.0), ("theta_1", "lower", 0.5)]
     is_named = decision == "WRONG_MODEL" and gate.details.get("effects") == ["bias"]
     assert is_named == (case == "an effect is missing")
 

@@ -7,7 +7,7 @@ import pytest
 import torch
 from sbi.utils import BoxUniform
 
-from sbi_active import GaussianNoise, SimulatorModel
+from sbi_active import SimulatorModel
 from sbi_active.criticism import Trials, close_loop, joint_prior
 from sbi_active.criticism.contradictions import (
     BoundParameter,
@@ -15,6 +15,7 @@ from sbi_active.criticism.contradictions import (
     MissedTrial,
     OutlyingTrial,
 )
+from tests.criticism import slope_world
 from tests.criticism.report.reports import (
     DRAG,
     MADE,
@@ -24,7 +25,7 @@ from tests.criticism.report.reports import (
     tracing,
     trials,
 )
-from tests.effects import BIAS, autocorrelated, on_outcomes
+from tests.effects import BIAS, autocorrelated, drift
 
 
 def noted(**changes):
@@ -165,17 +166,11 @@ def test_each_caution_has_its_case(kind):
 
 
 def test_trials_of_unknown_order_drift_nowhere():
-    def drifting(x, phi, action, context):
-        return x + phi * context.index[:, None]
-
-    drift = on_outcomes("drift", drifting, 0.1, needs_order=True)
-    action = torch.linspace(-2, 2, 16)[:, None].double()
-    x = action + 0.8
-    x = x + 0.1 * torch.randn(x.shape, generator=torch.manual_seed(1)).double()
-    model = SimulatorModel(lambda theta, xi: theta * xi, noise=GaussianNoise(0.1))
-    prior = BoxUniform(-3 * torch.ones(1), 3 * torch.ones(1))
-    own = Trials(action, x, order="unknown")
-    made = close_loop(model, prior, own, effects=[BIAS, drift], evaluate=False)
+    action = torch.linspace(-2, 2, 16)[:, None]
+    own = Trials(action, slope_world.read(action + 0.8, 1), order="unknown")
+    effects = [BIAS, drift(0.1, needs_order=True)]
+    given = slope_world.MODEL, slope_world.PRIOR, own
+    made = close_loop(*given, effects=effects, evaluate=False)
     assert "SA526" in [w.code for w in made.warnings]
     assert "drift" not in made.probabilities
     assert made.verdict == "bias"
