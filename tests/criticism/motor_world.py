@@ -6,7 +6,7 @@ from torch.distributions import HalfNormal
 
 from sbi_active import GaussianNoise, SimulatorModel
 from sbi_active.criticism import AugmentedSimulator, Context, Effect, Trials
-from tests.effects import effect, half, normal, on_outcomes
+from tests.effects import effect, half, normal
 
 NOISE = 0.05  # rad/s
 STEP = 0.02  # s
@@ -54,7 +54,7 @@ DEAD_ZONE = effect(
 )
 SHIFTED = _voltage(lambda u, phi: u + phi)
 OFFSET = effect("voltage offset", hook="input", prior=normal(0.2), apply=SHIFTED)
-BIAS = on_outcomes("bias", lambda x, phi, action, context: x + phi, sd=0.3)
+BIAS = effect(prior=normal(0.3))
 COULOMB = Effect.keyword("coulomb", prior=HalfNormal(0.5))
 LIBRARY = [DEAD_ZONE, OFFSET, BIAS, COULOMB]
 

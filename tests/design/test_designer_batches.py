@@ -1,7 +1,10 @@
 """Batches and pending trials against the linear-Gaussian closed form."""
 
+import math
+
+import pytest
 import torch
-from torch.distributions import MultivariateNormal
+from torch.distributions import MultivariateNormal, Normal
 
 from sbi_active import (
     AutocorrelatedNoise,
@@ -9,6 +12,13 @@ from sbi_active import (
     GaussianNoise,
     InformationGainDesigner,
     SimulatorModel,
+)
+from sbi_active.design import LikelihoodGain
+from sbi_active.design.estimators.base import CandidateSimulations
+from sbi_active.design.outcomes import (
+    JointLikelihood,
+    conditional_gain,
+    join_outcomes,
 )
 from tests.linear_gaussian import PRIOR
 
@@ -116,3 +126,35 @@ def test_a_linear_model_tells_what_it_tells_in_closed_form():
     assert float(design.action) == 3.0
     text = "32 linear summaries stand for the 300 numbers"
     assert any(text in note for note in design.notes)
+
+
+# Outcomes of several actions together
+
+
+class Slope:
+    """x = action * theta + e with e ~ N(0, 1), as an exact likelihood."""
+
+    exact_likelihood = True
+
+    def log_likelihood(self, x, theta, action):
+        return Normal(action * theta, 1.0).log_prob(x).sum(-1)
+
+
+def simulated(action, theta, seed):
+    generator = torch.Generator().manual_seed(seed)
+    mean = action[:, None] * theta
+    x = mean + torch.randn(mean.shape, generator=generator)
+    return CandidateSimulations(theta, action, x, mean)
+
+
+def test_what_an_action_tells_beyond_others_has_a_closed_form():
+    generator = torch.Generator().manual_seed(0)
+    theta = torch.randn(4_000, 1, generator=generator)
+    action, others = torch.tensor([[0.5], [2.0]]), torch.tensor([[1.0], [1.5]])
+    joint = join_outcomes(simulated(action, theta, 1), simulated(others, theta, 2))
+    estimator = LikelihoodGain(num_contrastive=1_000)
+    own = MultivariateNormal(torch.zeros(1), torch.eye(1))
+    gain = conditional_gain(estimator, JointLikelihood(Slope(), 1), joint, own, 2)
+    known = 1 + float(others.square().sum())
+    exact = [0.5 * math.log1p(a**2 / known) for a in (0.5, 2.0)]
+    assert gain.mean(1).tolist() == pytest.approx(exact, abs=0.04)
