@@ -2,14 +2,22 @@
 
 import re
 
-import matplotlib.pyplot
+import matplotlib.pyplot as plt
+import numpy as np
 import pandas as pd
 import pytest
 import torch
 from attrs import evolve
 from sbi.utils import BoxUniform
 
-from sbi_active import Campaign, DiscreteActions, GaussianNoise, SimulatorModel
+from sbi_active import (
+    BoxActions,
+    Campaign,
+    DiscreteActions,
+    GaussianNoise,
+    SimulatorModel,
+)
+from sbi_active.design.design import Design
 from sbi_active.display import Page, Section, Table
 from sbi_active.display.campaign_page import page as campaign_page
 from sbi_active.display.figures import legible
@@ -51,7 +59,15 @@ def test_parameters_have_mean_deviation_and_interval():
 # Names that a user chose: money, control marks and halves of pairs
 
 
-matplotlib.use("Agg")
+plt.switch_backend("Agg")
+
+
+@pytest.fixture(autouse=True)
+def _closed():
+    yield
+    plt.close("all")
+
+
 NAMES = ["cost [$] \x07", "half \ud800", "a$b$c\\frac{"]
 
 
@@ -187,7 +203,7 @@ def test_a_campaign_reads_well_in_a_browser(tmp_path):
 
 
 def test_ticks_of_a_logarithm_are_numbers():
-    figure, (left, right) = matplotlib.pyplot.subplots(1, 2)
+    figure, (left, right) = plt.subplots(1, 2)
     left.set(yscale="log", ylim=(1e-3, 1e3))
     right.set_yscale("symlog", linthresh=2)
     right.set_ylim(-100, 100)
@@ -195,4 +211,39 @@ def test_ticks_of_a_logarithm_are_numbers():
     texts = [text.get_text() for ax in (left, right) for text in ax.get_yticklabels()]
     assert {"0.01", "1", "\N{MINUS SIGN}10"} <= {*texts}
     assert "$" not in "".join(texts)
-    matplotlib.pyplot.close(figure)
+
+
+# What the picture of a design draws, for each kind of action
+
+
+def design(actions):
+    rows = actions.sample((30,), seed=0)
+    gain = rows.double().square().sum(1)
+    error = [torch.full_like(gain, 0.05)] * 4
+    made = {"bound": "lower", "index": 4, "num_simulations": 30}
+    return Design(rows[4], rows, gain, *error, **made, labels=actions.entry_labels)
+
+
+PUSHES = BoxActions([0.0, -1.0], [2.0, 1.0], names=["speed", "tilt"], units=["m/s", ""])
+
+
+def test_two_entries_make_a_map_with_every_candidate_and_the_chosen_one():
+    made = design(PUSHES)
+    ax = made.plot()
+    (marks,) = [c for c in ax.collections if len(c.get_offsets()) > 1]
+    np.testing.assert_allclose(marks.get_offsets(), made.candidates)
+    np.testing.assert_allclose(marks.get_array(), made.expected_information_gain)
+    (chosen,) = [each for each in ax.lines if each.get_label() == "chosen"]
+    np.testing.assert_allclose(chosen.get_xydata()[0], made.action)
+    assert (ax.get_xlabel(), ax.get_ylabel()) == ("speed [m/s]", "tilt")
+    assert [a.get_ylabel() for a in ax.figure.axes][1:] == ["EIG (lower bound) [nats]"]
+
+
+def test_more_entries_make_candidates_in_order() -> None:
+    made = design(BoxActions([0.0] * 3, [1.0] * 3))
+    ax = made.plot()
+    gain = made.expected_information_gain.sort(descending=True).values
+    np.testing.assert_allclose(ax.lines[0].get_ydata(), gain)
+    (chosen,) = [each for each in ax.lines if each.get_label() == "chosen"]
+    place = int(chosen.get_xdata()[0])
+    assert float(gain[place]) == float(made.expected_information_gain[made.index])

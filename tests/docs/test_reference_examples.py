@@ -60,7 +60,6 @@ def test_every_name_has_one(package):
 # What benchmarks print becomes tables of the site, from committed rows
 
 
-pytest.importorskip("sphinx")
 page = extension("results")
 
 
