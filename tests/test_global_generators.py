@@ -14,6 +14,7 @@ from sbi_active import (
     RandomDesigner,
     SeqBED,
     SimulatorModel,
+    seeding,
     simulate,
     to_inference_data,
 )
@@ -21,13 +22,6 @@ from sbi_active.actions import BoxActions, MixedActions
 from sbi_active.criticism import Trials, close_loop
 from sbi_active.inference import refine
 from sbi_active.inference.rounds.rows import Observation
-from sbi_active.seeding import (
-    derive_seed,
-    forked_generators,
-    row_normals,
-    row_seeds,
-    row_uniforms,
-)
 from sbi_active.simulation import check_simulator, estimate_noise
 from tests.campaign.problem import (
     ACTIONS,
@@ -125,7 +119,7 @@ def test_simulators_and_noise(kept):
     kept("model", lambda: MODEL(THETA, ACTION, seeds=seeds))
     kept("mean", lambda: MODEL.mean(THETA, ACTION))
     kept("sample", lambda: GaussianNoise(0.1).sample(X, seeds))
-    kept("derive_seed", lambda: derive_seed(0, "key"))
+    kept("derive_seed", lambda: seeding.derive_seed(0, "key"))
     kept("estimate_noise", lambda: estimate_noise(X[:40].reshape(4, 10, 1)))
     kept("check_simulator", lambda: check_simulator(noisy, PRIOR, ACTIONS, seed=0))
 
@@ -156,14 +150,14 @@ def test_what_draws_as_in_sbi_and_torch():
 
 
 def test_rows_depend_on_seed_and_index_alone():
-    together = row_normals(row_seeds(3, 100), 4)
-    apart = row_normals(row_seeds(3, 40, first=60), 4)
+    together = seeding.row_normals(seeding.row_seeds(3, 100), 4)
+    apart = seeding.row_normals(seeding.row_seeds(3, 40, first=60), 4)
     assert torch.equal(together[60:], apart)
-    assert not torch.equal(together, row_normals(row_seeds(4, 100), 4))
+    assert not torch.equal(together, seeding.row_normals(seeding.row_seeds(4, 100), 4))
 
 
 def test_row_normals_are_standard_normal_and_uncorrelated():
-    draws = row_normals(row_seeds(1, 20_000), 5).numpy()
+    draws = seeding.row_normals(seeding.row_seeds(1, 20_000), 5).numpy()
     assert stats.kstest(draws.ravel(), "norm").pvalue > 1e-3
     correlation = np.corrcoef(draws.T)[np.triu_indices(5, 1)]
     assert np.abs(correlation).max() < 4 / np.sqrt(20_000)
@@ -172,13 +166,13 @@ def test_row_normals_are_standard_normal_and_uncorrelated():
 
 
 def test_row_uniforms_are_uniform_and_continue_the_stream():
-    seeds = row_seeds(2, 20_000)
-    draws = row_uniforms(seeds, 4)
+    seeds = seeding.row_seeds(2, 20_000)
+    draws = seeding.row_uniforms(seeds, 4)
     assert stats.kstest(draws.numpy().ravel(), "uniform").pvalue > 1e-3
-    assert torch.equal(row_uniforms(seeds, 2, first=2), draws[:, 2:])
-    assert torch.equal(row_uniforms(seeds[[7, 3]], 4), draws[[7, 3]])
+    assert torch.equal(seeding.row_uniforms(seeds, 2, first=2), draws[:, 2:])
+    assert torch.equal(seeding.row_uniforms(seeds[[7, 3]], 4), draws[[7, 3]])
     normals = stats.norm.ppf(draws.numpy())
-    assert np.allclose(row_normals(seeds, 4).numpy(), normals, atol=1e-9)
+    assert np.allclose(seeding.row_normals(seeds, 4).numpy(), normals, atol=1e-9)
 
 
 def test_fork_seeds_inside_and_restores_outside():
@@ -187,9 +181,9 @@ def test_fork_seeds_inside_and_restores_outside():
     expected = torch.rand(1), np.random.rand()
     torch.manual_seed(5)
     np.random.seed(5)
-    with forked_generators(1, "key"):
+    with seeding.forked_generators(1, "key"):
         first = torch.rand(3), np.random.rand(3)
-    with forked_generators(1, "key"):
+    with seeding.forked_generators(1, "key"):
         second = torch.rand(3), np.random.rand(3)
     assert torch.equal(first[0], second[0])
     assert (first[1] == second[1]).all()

@@ -11,13 +11,7 @@ import torch
 from sbi_active.campaign.options import CampaignDetails
 from sbi_active.seeding import row_normals
 from sbi_active.simulation import Workers
-from tests.campaign.problem import (
-    ACTIONS,
-    PRIOR,
-    campaign,
-    draws,
-    noisy,
-)
+from tests.campaign.problem import ACTIONS, PRIOR, campaign, draws, noisy
 from tests.effects import BIAS
 
 TOLD = [(1.0, 0.62), (3.0, 1.75), (0.5, 0.33)]  # action, x at theta = .6

@@ -15,11 +15,7 @@ from sbi_active import (
 )
 from sbi_active.design import LikelihoodGain
 from sbi_active.design.estimators.base import CandidateSimulations
-from sbi_active.design.outcomes import (
-    JointLikelihood,
-    conditional_gain,
-    join_outcomes,
-)
+from sbi_active.design.outcomes import JointLikelihood, conditional_gain, join_outcomes
 from tests.linear_gaussian import PRIOR
 
 ANGLES = DiscreteActions([0.0, 0.25, 1.0], names=["angle"])

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,29 +12,6 @@ from scipy.stats import norm, t
 from sbi_active import GaussianNoise, StudentTNoise
 
 Array = NDArray[Any]
-
-
-class Error(Protocol):
-    """The distribution of one number of x less its mean.
-
-    Attributes:
-        scale: What it is proportional to: a deviation, or the half width.
-    """
-
-    @property
-    def scale(self) -> float: ...
-
-    def log_prob(self, e: Array) -> Array:
-        """Return log densities, of the shape of e."""
-        ...
-
-    def sample(self, shape: tuple[int, ...], rng: np.random.Generator) -> Array:
-        """Return independent errors."""
-        ...
-
-    def declared(self) -> Any:
-        """Return the library's noise model; None where it has none."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -85,3 +62,6 @@ class Uniform:
 
     def declared(self) -> Any:
         return None
+
+
+Error = Normal | Student | Uniform

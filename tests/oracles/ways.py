@@ -153,18 +153,13 @@ WAYS["campaign"] = Way(
     declared,
 )
 WAYS["max_simulations=1000"] = Way(
-    in_campaign(max_simulations=1_000, planned_trials=4),
-    few_declared,
+    in_campaign(max_simulations=1_000, planned_trials=4), few_declared
 )
 # Networks alone: with refine=True every method gives the belief of "campaign".
 WAYS["asbi, chained"] = Way(
-    in_campaign(method="asbi", refine=False, **SMALL),
-    few_declared,
+    in_campaign(method="asbi", refine=False, **SMALL), few_declared
 )
-WAYS["alhi"] = Way(
-    in_campaign(method="alhi", refine=False, **SMALL),
-    few_declared,
-)
+WAYS["alhi"] = Way(in_campaign(method="alhi", refine=False, **SMALL), few_declared)
 WAYS["seqbed"] = Way(
     in_campaign(method="seqbed", refine=False, num_simulations=2_000),
     lambda own: scalar(own) and declared(own),

@@ -32,7 +32,6 @@ class State:
 
     def __init__(self):
         self.qpos = np.zeros(2)
-        self.batch = torch.zeros(1000, 3)
 
 
 def one_row(theta, action, rng, *, context):
@@ -191,15 +190,6 @@ def test_effects_of_rows_may_be_changed():
     for _ in range(2):
         mean = model.mean(THETA[:4], ACTION[:4], gain=effect)
         assert torch.equal(mean - 1, THETA[:4])
-
-
-def test_simulations_keep_the_theta_that_was_simulated():
-    theta, action = THETA.clone(), ACTION.clone()
-    rows = simulate(changing, theta, action, seed=0)
-    theta.zero_()
-    action.zero_()
-    assert torch.equal(rows.theta, THETA)
-    assert torch.equal(rows.action, ACTION)
 
 
 def test_noise_keeps_the_values_that_were_declared():

@@ -9,11 +9,7 @@ import torch
 
 from sbi_active import DiscreteActions
 from sbi_active.criticism import Criticism, Trials, close_loop
-from sbi_active.criticism.experiments.choice import (
-    limit_of,
-    probability_of,
-    unless_unproven,
-)
+from sbi_active.criticism.experiments import choice
 from sbi_active.criticism.experiments.settle import NAME, VerdictError, settle
 from sbi_active.criticism.misfit.rule import Rule
 from tests.criticism.misfit import oscillator
@@ -141,7 +137,7 @@ def test_an_effect_is_withdrawn_by_the_rule_that_named_it():
         return replace(trial, registered=new, x=own.mean + own.sd)
 
     def after(*tested):
-        return unless_unproven(replace(report, tested=tested), remaining)
+        return choice.unless_unproven(replace(report, tested=tested), remaining)
 
     assert off(0.2).held
     for tested in ([trial], [off(0.9 * remaining)], [off(0.2), off(0.3)]):
@@ -155,7 +151,7 @@ def test_an_effect_is_withdrawn_by_the_rule_that_named_it():
     found = after(replace(trial, registered=replace(own, without={})))
     assert (found.verdict, found.tracing.beside) == ("unexplained", ("lag",))
     assert found.tracing.key == report.tracing.key  # it still predicts
-    assert probability_of(found) == 0.0
+    assert choice.probability_of(found) == 0.0
     assert found.warnings[-1].code == "SA533"
     assert "unexplained" in str(found).splitlines()[0]
 
@@ -165,7 +161,7 @@ def test_nine_of_ten_further_errors_stay_below_the_limit(most, worth):
     """Whatever the numbers of a trial are worth, and whatever their size."""
     rng = np.random.default_rng(0)
     draws = 7 * rng.chisquare(worth, (600, 8)) / worth
-    below = [new <= limit_of(before, most) ** 2 for *before, new in draws]
+    below = [new <= choice.limit_of(before, most) ** 2 for *before, new in draws]
     # A prior of what a trial is worth has a share in it where few trials tell of that.
     assert 0.86 < np.mean(below) < 0.96
 

@@ -24,19 +24,6 @@ def rival():
     return RivalSet(model, PRIOR, trials, []).rival(ModelKey())
 
 
-def told(model):
-    """Return how much the trials tell of the direction that they tell least of."""
-    return np.linalg.svd(model.jacobian, compute_uv=False)[-1]
-
-
-def test_slopes_from_both_sides_tell_nothing_of_what_a_product_leaves_open():
-    own, unit = rival(), np.full(8, SD)
-    u = own.coordinates.from_z(np.array([[9.0, 1.1]]))[0]
-    one_sided = linearize(own, u, unit)
-    assert told(one_sided) > 1
-    assert told(centered(own, one_sided, unit)) < 0.1
-
-
 def test_at_a_bound_the_slope_is_from_within():
     own, unit = rival(), np.full(8, SD)
     for corner in (own.coordinates.low, own.coordinates.high):

@@ -109,14 +109,11 @@ def oscillator(n, index, seed=0):
     return CandidateSimulations(theta, action, noise.sample(mean), mean, noise), prior
 
 
-def test_nested_monte_carlo_is_the_closed_form():
+def test_nested_monte_carlo_has_the_closed_form_and_a_wrong_declaration_none():
     actions = torch.tensor([[0.0], [0.5], [2.0], [20.0], [500.0]])
     gain, error = estimate(declared(n=400, actions=actions))
     assert ((gain - information(actions)).abs() < 4 * error + LOCAL).all()
     assert float(gain[0].abs()) < 4 * float(error[0]) + 0.01
-
-
-def test_a_wrong_declaration_is_wrong_by_nested_monte_carlo():
     gain, error = estimate(declared(n=400, declared_sd=0.5))
     wrong = (gain - information(ACTIONS)).abs() > 4 * error + LOCAL
     assert wrong.tolist() == [False, True, True, True]  # where x tells anything

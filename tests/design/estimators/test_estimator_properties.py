@@ -6,14 +6,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from sbi_active.design import (
-    EntropyGain,
-    LikelihoodGain,
-    LinearGain,
-    NestedGain,
-    PosteriorGain,
-    RatioGain,
-)
+from sbi_active import design
 from sbi_active.design.estimators.base import CandidateSimulations
 from sbi_active.design.estimators.contrast import InfoNCEGain
 from sbi_active.design.estimators.emulator import MeanEmulator
@@ -39,13 +32,13 @@ class Everything(ExactLikelihoodAndPosterior, ExactRatio):
 
 
 ESTIMATORS = {
-    "entropy": EntropyGain(),
+    "entropy": design.EntropyGain(),
     "info_nce": InfoNCEGain(num_contrastive=31),
-    "likelihood": LikelihoodGain(num_contrastive=50),
-    "linear": LinearGain(),
-    "nested": NestedGain(),
-    "posterior": PosteriorGain(),
-    "ratio": RatioGain(),
+    "likelihood": design.LikelihoodGain(num_contrastive=50),
+    "linear": design.LinearGain(),
+    "nested": design.NestedGain(),
+    "posterior": design.PosteriorGain(),
+    "ratio": design.RatioGain(),
 }
 DRAWING = {"entropy", "nested"}  # other numbers in turn
 FROM_MODELS = sorted(set(ESTIMATORS) - {"entropy", "linear", "nested"})
@@ -129,7 +122,7 @@ def simulations(n=4_000):
 def test_a_model_of_the_wrong_spread_loses_what_the_divergence_says(spread):
     """E U = I - KL(N(m, s) || N(m, (k s)^2)) in each of two dimensions."""
     rows = simulations()
-    gain = PosteriorGain()(ExactModel(spread=spread), rows, PRIOR)
+    gain = design.PosteriorGain()(ExactModel(spread=spread), rows, PRIOR)
     loss = 2 * (math.log(spread) + 0.5 / spread**2 - 0.5)
     error = gain.std(1) / gain.shape[1] ** 0.5
     distance = (gain.mean(1) - (information(rows.action) - loss)).abs()
@@ -142,7 +135,7 @@ def test_outcomes_without_a_density_are_not_left_out_of_the_mean():
             return torch.where(theta[:, 0] > 0, torch.nan, theta[:, 0])
 
     with pytest.raises(ValueError, match=r"densities of Overflows; got NaN at"):
-        PosteriorGain()(Overflows(), simulations(n=64), PRIOR)
+        design.PosteriorGain()(Overflows(), simulations(n=64), PRIOR)
 
 
 # Interpolated noise-free outcomes

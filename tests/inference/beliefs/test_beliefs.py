@@ -7,20 +7,7 @@ import pytest
 import torch
 from sbi.utils import BoxUniform, MultipleIndependent
 from sbi.utils.torchutils import set_validate_args
-from torch.distributions import (
-    Bernoulli,
-    Categorical,
-    Cauchy,
-    Dirichlet,
-    Distribution,
-    Independent,
-    MixtureSameFamily,
-    Normal,
-    Poisson,
-    TransformedDistribution,
-    Uniform,
-    VonMises,
-)
+from torch import distributions as dist
 from torch.distributions.transforms import AffineTransform, ExpTransform
 
 from sbi_active import BoxActions, Campaign, GaussianNoise, SimulatorModel
@@ -56,9 +43,9 @@ ACTION, X = torch.tensor([[1.0], [2.0]]), torch.tensor([[1.2], [1.9]])
 #: A gear of three, a slope, a switch.
 PRIOR = MultipleIndependent(
     [
-        Categorical(torch.tensor([[0.5, 0.3, 0.2]])),
+        dist.Categorical(torch.tensor([[0.5, 0.3, 0.2]])),
         BoxUniform(torch.tensor([-3.0]), torch.tensor([3.0])),
-        Bernoulli(torch.tensor([0.25])),
+        dist.Bernoulli(torch.tensor([0.25])),
     ],
     validate_args=False,
 )
@@ -79,7 +66,7 @@ def exact():
     for gear in range(3):
         for switch in range(2):
             mean = slope * ACTION.double() * (1 + gear) + switch
-            log_l = Normal(mean, SD).log_prob(X.double()).sum(0)
+            log_l = dist.Normal(mean, SD).log_prob(X.double()).sum(0)
             prior = math.log((0.5, 0.3, 0.2)[gear] * (0.75, 0.25)[switch])
             log_mass[gear, switch] = log_l.logsumexp(0) + prior
     step = float(slope[1] - slope[0])
@@ -88,8 +75,7 @@ def exact():
 
 
 @pytest.mark.parametrize(
-    "simulator",
-    [SimulatorModel(line, noise=GaussianNoise(SD)), drawn],
+    "simulator", [SimulatorModel(line, noise=GaussianNoise(SD)), drawn]
 )
 def test_values_get_their_probabilities(simulator):
     belief = refine(simulator, PRIOR, ACTION, X, seed=0)
@@ -119,7 +105,7 @@ def test_noise_is_not_inflated_for_a_value_that_trials_rule_out():
     def offset(theta, action):
         return theta[:, :1] * action + 3 * theta[:, 1:]
 
-    switch = Bernoulli(torch.tensor([1e-3]))
+    switch = dist.Bernoulli(torch.tensor([1e-3]))
     parts = [BoxUniform(torch.tensor([-3.0]), torch.tensor([3.0])), switch]
     prior = MultipleIndependent(parts, validate_args=False)
     action = torch.tensor([[1.0], [1.0], [-1.0], [-1.0]])
@@ -155,17 +141,20 @@ TWO = torch.ones(2)
 SHIFTED_EXPONENTIAL = [ExpTransform(), AffineTransform(0.2, 1.0)]
 
 
-def independent(prior: Distribution) -> Independent:
-    return Independent(prior, 1)
+def independent(prior: dist.Distribution) -> dist.Independent:
+    return dist.Independent(prior, 1)
 
 
 @pytest.mark.parametrize(
     ("prior", "message"),
     [
-        (independent(Poisson(3 * TWO)), "continuous parameters; got a discrete one"),
-        (independent(Bernoulli(0.5 * TWO)), "declare the choice as an Effect"),
-        (Dirichlet(TWO), "may vary one by one; got Dirichlet"),
-        (Normal(0.0, 1.0), r"event shape \(theta_dim,\); got Normal"),
+        (
+            independent(dist.Poisson(3 * TWO)),
+            "continuous parameters; got a discrete one",
+        ),
+        (independent(dist.Bernoulli(0.5 * TWO)), "declare the choice as an Effect"),
+        (dist.Dirichlet(TWO), "may vary one by one; got Dirichlet"),
+        (dist.Normal(0.0, 1.0), r"event shape \(theta_dim,\); got Normal"),
     ],
 )
 def test_what_is_discrete_or_tied_is_refused(prior, message):
@@ -176,7 +165,7 @@ def test_what_is_discrete_or_tied_is_refused(prior, message):
 
 
 def test_draws_that_repeat_are_refused():
-    class Rounded(Normal):
+    class Rounded(dist.Normal):
         def sample(self, sample_shape=torch.Size()):  # noqa: B008
             return super().sample(sample_shape).round()
 
@@ -188,7 +177,7 @@ def scaled(theta, action):
     return theta * action
 
 
-def campaign(prior: Distribution, network: str = "on demand") -> Campaign:
+def campaign(prior: dist.Distribution, network: str = "on demand") -> Campaign:
     model = SimulatorModel(scaled, noise=GaussianNoise(0.2))
     options = {"num_simulations": 300, "num_samples": 100, "num_scored": 100}
     options |= {"network": network}
@@ -198,19 +187,21 @@ def campaign(prior: Distribution, network: str = "on demand") -> Campaign:
 @pytest.mark.parametrize(
     "prior",
     [
-        independent(Cauchy(0 * TWO, TWO)),
-        TransformedDistribution(independent(Normal(0 * TWO, TWO)), SHIFTED_EXPONENTIAL),
-        MixtureSameFamily(
-            Categorical(TWO),
-            independent(Uniform(torch.tensor([[0.0], [0.2]]).expand(2, 2), 1.0)),
+        independent(dist.Cauchy(0 * TWO, TWO)),
+        dist.TransformedDistribution(
+            independent(dist.Normal(0 * TWO, TWO)), SHIFTED_EXPONENTIAL
         ),
-        independent(VonMises(0 * TWO, TWO)),
+        dist.MixtureSameFamily(
+            dist.Categorical(TWO),
+            independent(dist.Uniform(torch.tensor([[0.0], [0.2]]).expand(2, 2), 1.0)),
+        ),
+        independent(dist.VonMises(0 * TWO, TWO)),
     ],
     ids=["Cauchy", "shifted log-normal", "mixture of bounds", "angle"],
 )
 def test_heavy_tails_and_mixtures_give_the_right_posterior(prior):
     set_validate_args(prior, True)  # as after an import of pyro, which says so for all
-    x, is_mixed = torch.tensor([0.6, 0.5]), isinstance(prior, MixtureSameFamily)
+    x, is_mixed = torch.tensor([0.6, 0.5]), isinstance(prior, dist.MixtureSameFamily)
     c = campaign(prior, "each round" if is_mixed else "on demand")
     if is_mixed:
         c.ask()  # the network is trained and asked as well

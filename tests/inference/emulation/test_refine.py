@@ -51,23 +51,28 @@ def draws(belief: Distribution, num: int, seed: int = 0) -> Tensor:
         return belief.sample((num,))
 
 
-# Refined beliefs against closed forms, oracles and worlds that must be flagged
+#: The ends of the actions, twice.
+ENDS = torch.tensor([[-5.0], [5.0], [-5.0], [5.0]])
+FEW = RefinementOptions(num_histories=500)
+
+
+def believed(simulator, theta, settings=FEW):
+    """Return the belief of trials at the ends, and their outcomes."""
+    x = observe(simulator, theta, ENDS, 0)
+    return refine(simulator, BOX, ENDS, x, settings=settings, seed=0), x
 
 
 @pytest.fixture(scope="module")
-def linear() -> tuple[LearnedBelief, Tensor, Tensor]:
-    action = torch.tensor([[-5.0], [5.0], [-5.0], [5.0]])
-    simulator = numerical()
-    x = observe(simulator, torch.tensor([[-3.0, 1.0]]), action, 0)
-    belief = refine(simulator, BOX, action, x, seed=0)
+def linear() -> tuple[LearnedBelief, Tensor]:
+    belief, x = believed(numerical(), torch.tensor([[-3.0, 1.0]]), RefinementOptions())
     assert isinstance(belief, LearnedBelief)
-    return belief, action, x
+    return belief, x
 
 
 def test_same_seed_same_belief_and_a_pickled_one(linear):
-    belief, action, x = linear
+    belief, x = linear
     torch.rand(7)  # the global state must not matter
-    again = refine(numerical(), BOX, action, x, seed=0)
+    again = refine(numerical(), BOX, ENDS, x, seed=0)
     theta = draws(belief, 200)
     assert torch.equal(belief.log_prob(theta), again.log_prob(theta))
     assert torch.equal(theta, draws(again, 200))
@@ -97,11 +102,7 @@ def test_budget_is_respected():
 
 @pytest.mark.parametrize("noise", ["gaussian", "uniform"])
 def test_hard_edged_noise_is_flagged(noise: str):
-    action = torch.tensor([[-5.0], [5.0], [-5.0], [5.0]])
-    settings = RefinementOptions(num_histories=500)
-    simulator = numerical(noise=noise)
-    x = observe(simulator, torch.tensor([[1.0, 2.0]]), action, 0)
-    belief = refine(simulator, BOX, action, x, settings=settings, seed=0)
+    belief, _ = believed(numerical(noise=noise), torch.tensor([[1.0, 2.0]]))
     holds = belief.diagnostics.assumptions["gaussian_noise"].holds
     assert holds == (noise == "gaussian")
     if noise == "uniform":
@@ -109,14 +110,9 @@ def test_hard_edged_noise_is_flagged(noise: str):
 
 
 def test_four_sharp_modes_are_flagged():
-    action = torch.tensor([[-5.0], [5.0], [-5.0], [5.0]])
-    simulator = numerical("sine")
     with forked_generators(0, "truth"):
         theta = BOX.sample((1,))
-    x = observe(simulator, theta, action, 0)
-    settings = RefinementOptions(num_histories=500)
-    belief = refine(simulator, BOX, action, x, settings=settings, seed=0)
-    diagnostics = belief.diagnostics
+    diagnostics = believed(numerical("sine"), theta)[0].diagnostics
     assert not diagnostics.trustworthy
     assert not diagnostics.assumptions["smooth_response"].holds
 
@@ -125,8 +121,7 @@ def test_impossible_observation_is_flagged(linear):
     assert 0.01 < linear[0].diagnostics.tail_probability <= 1
     action = torch.tensor([[0.0], [0.0], [5.0]])
     x = torch.tensor([[50.0], [-50.0], [200.0]])  # the same action, 100 sigma apart
-    settings = RefinementOptions(num_histories=500)
-    belief = refine(numerical(), BOX, action, x, settings=settings, seed=0)
+    belief = refine(numerical(), BOX, action, x, settings=FEW, seed=0)
     diagnostics = belief.diagnostics
     assert diagnostics.tail_probability < 1e-3
     assert "unlike anything simulated" in " ".join(diagnostics.warnings)

@@ -11,7 +11,7 @@ from attrs import evolve
 
 from sbi_active import CampaignOptions, MixtureDensity, simulate
 from sbi_active.campaign.options import CampaignDetails, StopRules
-from sbi_active.campaign.storage.codec import decode, encode, made
+from sbi_active.campaign.storage.codec import decode, encode
 from sbi_active.inference import LFIRE, RefinementOptions
 from sbi_active.inference.networks.mixture_density import MixtureDetails
 from sbi_active.inference.networks.ratio_network import RatioClassifier
@@ -96,11 +96,6 @@ def eval_of(options):
     kinds = (Workers, StopRules, CampaignDetails, RefinementOptions, CampaignOptions)
     networks = (RatioClassifier, LFIRE, MixtureDensity, MixtureDetails)
     return eval(repr(options), {kind.__name__: kind for kind in (*kinds, *networks)})
-
-
-def test_what_was_stored_before_an_option_came_has_its_default():
-    name = "sbi_active.campaign.options:CampaignDetails"
-    assert made(name, {"num_scored": 200}) == CampaignDetails(num_scored=200)
 
 
 STOPS = {"stop": 3}
