@@ -8,6 +8,10 @@ import torch
 from torch import Tensor
 from torch.distributions import Distribution, MultivariateNormal
 
+from sbi_active import GaussianNoise
+from sbi_active.design import Design
+from sbi_active.design.estimators.base import CandidateSimulations
+
 DIM = 2
 PRIOR = MultivariateNormal(torch.zeros(DIM), torch.eye(DIM))
 
@@ -40,6 +44,23 @@ def divergence(belief: Distribution, exact: Distribution) -> float:
 def information(action: Tensor) -> Tensor:
     """Exact information gain, (a, 1) -> (a,)."""
     return DIM * 0.5 * torch.log1p(action[:, 0] ** 2)
+
+
+def candidates(action, num, *, noise=torch.randn_like, declared=None, pairs=False):
+    """Return simulations of candidates, with the noise declared or in pairs."""
+    torch.manual_seed(0)
+    theta = PRIOR.sample((num,))
+    mean = action[:, None] * theta
+    x, again = (mean + noise(mean) for _ in "ab")
+    if declared is not None:
+        return CandidateSimulations(theta, action, x, mean, GaussianNoise(declared))
+    return CandidateSimulations(theta, action, x, replicate=again if pairs else None)
+
+
+def require_near(design: Design, exact: Tensor, bias: float = 1e-6) -> None:
+    """Require gains within four of their standard errors, and a bias, of exact ones."""
+    distance = (design.expected_information_gain - exact).abs()
+    assert (distance < 4 * design.standard_error + bias).all()
 
 
 class ExactModel:

@@ -65,6 +65,15 @@ def test_all_are_listed(capsys):
         assert line, name
 
 
+@pytest.mark.parametrize("words", [["search", "--wrong"], ["search", "--seeds", "a"]])
+def test_a_wrong_option_ends_the_run(words, capsys):
+    with pytest.raises(SystemExit) as ended:
+        main(words)
+    assert ended.value.code == 2
+    assert "usage: python -m benchmarks search" in capsys.readouterr().err
+    assert main(["serach"]) == 2
+
+
 def test_every_command_that_is_written_down_names_a_benchmark():
     files = [ROOT / "README.md", *ROOT.glob("docs/**/*.md"), *HERE.rglob("*.py")]
     for path in files:

@@ -2,6 +2,7 @@
 
 import pickle
 
+import mujoco
 import numpy as np
 import pytest
 import torch
@@ -12,6 +13,7 @@ from sbi_active.actions.signals import SignalActions
 from sbi_active.actions.waveforms import step
 from sbi_active.criticism import Trials
 from sbi_active.mujoco import from_mjcf
+from sbi_active.mujoco.models.spec import Source
 from sbi_active.mujoco.robot import Robot
 from sbi_active.simulation import Outcome, simulate
 from tests.campaign.problem import REFINEMENT
@@ -171,3 +173,40 @@ def test_the_belief_of_a_campaign_is_kept(tmp_path):
         assert torch.equal(read.belief.mean, belief.mean)
     with Campaign.load(tmp_path / "c", simulator=pendulum().simulator) as loaded:
         assert torch.equal(loaded.belief.log_prob(truth), belief.log_prob(truth))
+
+
+# A model's source: the same model in every process
+
+
+CORNERS = [(x, y, z) for x in (0, 1) for y in (0, 1) for z in (0, 2)]
+BLOCK = """<mujoco><compiler meshdir="parts"/>
+<asset><mesh name="block" file="block.obj"/>
+<texture name="wood" type="2d" file="missing.png"/>
+<material name="wooden" texture="wood" rgba="1 0 0 1"/></asset>
+<worldbody><body><joint name="hinge" axis="0 1 0"/>
+<geom type="mesh" mesh="block" material="wooden"/></body></worldbody></mujoco>"""
+
+
+@pytest.fixture
+def path(tmp_path):
+    (tmp_path / "parts").mkdir()
+    lines = [f"v {x} {y} {z}" for x, y, z in CORNERS]
+    lines += ["f 1 2 4", "f 1 4 3", "f 5 8 6", "f 5 7 8", "f 1 5 6", "f 1 6 2"]
+    lines += ["f 3 4 8", "f 3 8 7", "f 1 3 7", "f 1 7 5", "f 2 6 8", "f 2 8 4"]
+    (tmp_path / "parts/block.obj").write_text("\n".join(lines))
+    (tmp_path / "block.xml").write_text(BLOCK)
+    return tmp_path / "block.xml"
+
+
+def from_elsewhere(path, monkeypatch):
+    monkeypatch.chdir(path.parent)
+    return mujoco.MjSpec.from_file("block.xml")
+
+
+@pytest.mark.parametrize("is_spec", [False, True])
+def test_other_processes_find_meshes_beside_the_file(path, monkeypatch, is_spec):
+    source = Source(from_elsewhere(path, monkeypatch) if is_spec else path)
+    monkeypatch.chdir("/")
+    here, there = source.compile(), pickle.loads(pickle.dumps(source)).compile()
+    assert here.body_mass[1] == pytest.approx(2000.0, rel=1e-6)
+    np.testing.assert_array_equal(here.body_inertia, there.body_inertia)

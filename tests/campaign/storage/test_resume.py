@@ -82,6 +82,8 @@ def test_without_a_simulator_it_is_read_told_and_corrected(tmp_path):
     with pytest.raises(ValueError, match="pass it: Campaign.load"):
         reader.update()
     reader.correct(0, 2 * campaigns.outcome(action, 0), reason="gain of 2")
+    assert reader.not_in_belief == [0, 1]  # which rests on what was told before
+    assert "corrected since" in reader.belief.diagnostics.warnings[0]
     reader.close()
 
     whole = campaigns.new()

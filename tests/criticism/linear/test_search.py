@@ -10,8 +10,10 @@ from sbi_active import GaussianNoise, SimulatorModel
 from sbi_active.criticism import Criticism, Trials
 from sbi_active.criticism.linear import screening
 from sbi_active.criticism.linear.fits import FitSettings
+from sbi_active.criticism.linear.model import centered, linearize
 from sbi_active.criticism.linear.search import Search
 from sbi_active.criticism.results import ModelKey
+from sbi_active.criticism.rivals.rival_set import RivalSet
 from sbi_active.criticism.steps import equivalence
 from sbi_active.criticism.steps.detection import log_priors
 from tests.effects import drift, louder, on_outcomes
@@ -63,6 +65,22 @@ def test_no_pair_is_fitted_where_linear_evidence_puts_all_behind():
     search = searched(behind=-np.inf)
     search.fit_larger()
     assert max(len(key.effects) for key in search.found) == 1
+
+
+def test_at_a_bound_the_slope_is_from_within():
+    def saturating(theta, xi):
+        return torch.tanh(0.1 * xi * theta[:, :1] * theta[:, 1:])
+
+    model = SimulatorModel(saturating, noise=GaussianNoise(1e-6))
+    prior = BoxUniform(torch.tensor([1.0, 0.5]), torch.tensor([20.0, 2.0]))
+    xi, unit = torch.linspace(0.5, 1.5, 8)[:, None], np.full(8, 1e-6)
+    trials = Trials(xi, torch.tanh(0.99 * xi))
+    own = RivalSet(model, prior, trials, []).rival(ModelKey())
+    for corner in (own.coordinates.low, own.coordinates.high):
+        one_sided = linearize(own, corner, unit)
+        both = centered(own, one_sided, unit)
+        np.testing.assert_allclose(both.jacobian, one_sided.jacobian)
+        assert np.isfinite(both.jacobian).all()
 
 
 # A library of effects, all fitted, and one of one more, screened, say the same

@@ -5,7 +5,6 @@ import math
 import pytest
 import torch
 from sbi.utils import BoxUniform
-from torch.distributions import Distribution
 
 from sbi_active import DiscreteActions, InformationGainDesigner, SimulatorModel
 from sbi_active.design import LikelihoodGain, LinearGain, PosteriorGain, RatioGain
@@ -18,22 +17,20 @@ from tests.linear_gaussian import (
     ExactLikelihood,
     ExactLikelihoodAndPosterior,
     ExactRatio,
+    candidates,
     information,
 )
 
-GAUSSIAN = torch.distributions.Normal(0.0, 1.0)
 NEAR, FAR = torch.tensor([[0.5], [1.0]]), torch.tensor([[0.5], [40.0]])  # 7.4 nats
 
 
-def rows(actions=NEAR, n=512, noise: Distribution = GAUSSIAN, pairs=False):
-    theta = PRIOR.sample((n,))
-    x, again = (actions[:, None] * theta + noise.sample((2, n, 2)) for _ in "ab")
-    return CandidateSimulations(theta, actions, x, replicate=again if pairs else None)
+def heavy(mean):
+    return torch.distributions.StudentT(3.0).sample(mean.shape)
 
 
-def unusable(actions=NEAR, n=512):
+def unusable(actions=NEAR):
     """Noise from heavy-tailed pairs, which fails the test of normality."""
-    return rows(actions, n, torch.distributions.StudentT(3.0), pairs=True)
+    return candidates(actions, 512, noise=heavy, pairs=True)
 
 
 @pytest.mark.parametrize(
@@ -50,7 +47,9 @@ def test_what_the_model_can_say_is_used_where_the_noise_cannot(model, estimator)
     assert "noise is not Gaussian" in notes[0]
     if model is None:
         assert notes[-1] == "used all the same: there is no model"
-        estimator = type(choose_estimator(None, rows(pairs=True), PRIOR)[0])
+        estimator = type(
+            choose_estimator(None, candidates(NEAR, 512, pairs=True), PRIOR)[0]
+        )
     assert type(chosen) is estimator
 
 
@@ -87,7 +86,7 @@ def test_a_ratio_beyond_the_reach_of_info_nce_is_averaged():
 )
 def test_an_estimate_near_its_limit_is_said_to_be(estimator, text):
     model = ExactLikelihood()
-    far, near = rows(FAR), rows(NEAR)
+    far, near = candidates(FAR, 512), candidates(NEAR, 512)
     gain = estimator(model, far, PRIOR)
     notes = estimator.cautions(gain)
     assert len(notes) == 1
@@ -101,7 +100,7 @@ def test_an_estimate_near_its_limit_is_said_to_be(estimator, text):
 
 
 def test_a_ratio_whose_normalization_is_off_is_noticed():
-    simulations = rows()
+    simulations = candidates(NEAR, 512)
     for offset, expected in ((0.0, 0), (1.0, 1)):
         given = ExactRatio(offset=offset), simulations, PRIOR
         notes = RatioGain().compared(*given, RatioGain()(*given))

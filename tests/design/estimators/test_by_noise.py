@@ -18,26 +18,18 @@ from sbi_active.simulation import GaussianNoise, SimulatorModel
 from sbi_active.simulation.workers.settings import IN_PROCESS
 from sbi_active.tasks.oscillator import model
 from sbi_active.tasks.oscillator.reference import OscillatorReference
-from tests.linear_gaussian import PRIOR, information
+from tests.linear_gaussian import PRIOR, candidates, information
 
 BIAS = 0.06  # bound for d = 2 and n = 2000, k = 4, under gains up to 1.6 nats
 ACTIONS = torch.tensor([[0.0], [0.5], [1.0], [2.0]])
 
 
 def declared(n=2_000, actions=ACTIONS, declared_sd=1.0):
-    torch.manual_seed(0)
-    theta = PRIOR.sample((n,))
-    mean = actions[:, None] * theta
-    x = mean + torch.randn_like(theta)
-    return CandidateSimulations(theta, actions, x, mean, GaussianNoise(declared_sd))
+    return candidates(actions, n, declared=declared_sd)
 
 
 def replicated(noise=torch.randn_like):
-    torch.manual_seed(0)
-    theta = PRIOR.sample((2_000,))
-    rows = theta.expand(4, -1, -1)
-    x, again = (ACTIONS[:, None] * theta + noise(rows) for _ in "ab")
-    return CandidateSimulations(theta, ACTIONS, x, replicate=again)
+    return candidates(ACTIONS, 2_000, noise=noise, pairs=True)
 
 
 def distance(simulations, exact):

@@ -7,17 +7,15 @@ import pytest
 import torch
 
 from sbi_active import design
-from sbi_active.design.estimators.base import CandidateSimulations
 from sbi_active.design.estimators.contrast import InfoNCEGain
 from sbi_active.design.estimators.emulator import MeanEmulator
-from sbi_active.simulation import GaussianNoise
 from tests.linear_gaussian import (
     PRIOR,
     ExactLikelihoodAndPosterior,
     ExactModel,
     ExactRatio,
+    candidates,
     information,
-    simulator,
 )
 
 ACTIONS = torch.tensor([[0.0], [0.5], [2.0]])
@@ -46,10 +44,7 @@ FROM_MODELS = sorted(set(ESTIMATORS) - {"entropy", "linear", "nested"})
 
 @pytest.fixture
 def rows():
-    theta = torch.randn(128, 2)
-    mean = ACTIONS[:, None] * theta
-    x = mean + torch.randn_like(theta)
-    return CandidateSimulations(theta, ACTIONS, x, mean, GaussianNoise(1.0))
+    return candidates(ACTIONS, 128, declared=1.0)
 
 
 @pytest.mark.parametrize("name", ESTIMATORS)
@@ -112,16 +107,10 @@ def test_a_model_that_cannot_say_is_an_error(name, rows):
 # Gains by a posterior that is exact, too wide, or has no density
 
 
-def simulations(n=4_000):
-    theta, action = torch.randn(n, 2), torch.tensor([[0.0], [1.0], [2.0]])
-    x = torch.stack([simulator(theta, a.expand(n, 1)) for a in action])
-    return CandidateSimulations(theta, action, x)
-
-
 @pytest.mark.parametrize("spread", [1.0, 2.0])
 def test_a_model_of_the_wrong_spread_loses_what_the_divergence_says(spread):
     """E U = I - KL(N(m, s) || N(m, (k s)^2)) in each of two dimensions."""
-    rows = simulations()
+    rows = candidates(ACTIONS, 4_000)
     gain = design.PosteriorGain()(ExactModel(spread=spread), rows, PRIOR)
     loss = 2 * (math.log(spread) + 0.5 / spread**2 - 0.5)
     error = gain.std(1) / gain.shape[1] ** 0.5
@@ -135,7 +124,7 @@ def test_outcomes_without_a_density_are_not_left_out_of_the_mean():
             return torch.where(theta[:, 0] > 0, torch.nan, theta[:, 0])
 
     with pytest.raises(ValueError, match=r"densities of Overflows; got NaN at"):
-        design.PosteriorGain()(Overflows(), simulations(n=64), PRIOR)
+        design.PosteriorGain()(Overflows(), candidates(ACTIONS, 64), PRIOR)
 
 
 # Interpolated noise-free outcomes
