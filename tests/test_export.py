@@ -27,7 +27,7 @@ PRIOR = BoxUniform(torch.zeros(2), torch.ones(2))
 @pytest.fixture(scope="module")
 def campaign():
     names = {"parameter_names": ["mass", "friction"], "channel_names": ["x", "y"]}
-    model = SimulatorModel(lambda t, a: t * a, noise=GaussianNoise(0.2), **names)
+    model = SimulatorModel(lambda t, a: t * a, noise=0.2, **names)
     actions = DiscreteActions([1.0, 2.0], names=["push"])
     c = Campaign(model, PRIOR, actions, method="nsbi", options=OPTIONS)
     for _ in range(3):

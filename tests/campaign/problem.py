@@ -8,7 +8,6 @@ from sbi_active import (
     Campaign,
     CampaignOptions,
     DiscreteActions,
-    GaussianNoise,
     MixtureDensity,
     RefinementOptions,
     SimulatorModel,
@@ -18,7 +17,7 @@ from sbi_active.inference.networks.ratio_network import RatioClassifier
 
 PRIOR = BoxUniform(torch.zeros(1), torch.ones(1))
 ACTIONS = DiscreteActions([0.5, 1.0, 3.0])
-MODEL = SimulatorModel(lambda theta, action: theta * action, noise=GaussianNoise(0.1))
+MODEL = SimulatorModel(lambda theta, action: theta * action, noise=0.1)
 REFINEMENT = RefinementOptions(num_histories=200, num_effective=25)
 DETAILS = CampaignDetails(num_scored=200)
 OPTIONS = CampaignOptions(

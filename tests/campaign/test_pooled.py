@@ -9,7 +9,6 @@ from sbi_active import (
     Campaign,
     CampaignOptions,
     DiscreteActions,
-    GaussianNoise,
     MixedActions,
     RefinementOptions,
     SimulatorModel,
@@ -90,7 +89,7 @@ class Counted:
 
 def test_no_simulation_beyond_the_budget():
     fn = Counted()
-    model = SimulatorModel(fn, noise=GaussianNoise(0.05))
+    model = SimulatorModel(fn, noise=0.05)
     options = CampaignOptions(max_simulations=160, planned_trials=2, refinement=FEW)
     c = Campaign(model, PRIOR, DiscreteActions([0.5, 1.0]), options=options)
     truth = torch.tensor([[0.6, 0.3]])
@@ -117,7 +116,7 @@ def test_no_simulation_beyond_the_budget():
 
 def test_an_effect_is_adopted_within_the_budget():
     """A pool learns the augmented simulator, and never the prior's 2,000 rows."""
-    model = SimulatorModel(lambda t, a: t[:, :1] * a, noise=GaussianNoise(0.05))
+    model = SimulatorModel(lambda t, a: t[:, :1] * a, noise=0.05)
     prior = BoxUniform(torch.zeros(1), torch.ones(1))
     options = {"max_simulations": 600, "planned_trials": 4, "refinement": FEW}
     actions = DiscreteActions([-2.0, -1.0, 1.0, 2.0])

@@ -4,7 +4,7 @@ import torch
 from sbi.utils import BoxUniform
 from torch.distributions import HalfNormal
 
-from sbi_active import GaussianNoise, SimulatorModel
+from sbi_active import SimulatorModel
 from sbi_active.criticism import AugmentedSimulator, Context, Effect, Trials
 from tests.effects import effect, half, normal
 
@@ -34,9 +34,7 @@ def speed(theta, action, *, inputs, times, input_times, start, coulomb=0.0):
     return (1 - part) * series.gather(1, low) + part * series.gather(1, low + 1)
 
 
-MODEL = SimulatorModel(
-    speed, noise=GaussianNoise(NOISE), parameter_names=["gain", "tau"]
-)
+MODEL = SimulatorModel(speed, noise=NOISE, parameter_names=["gain", "tau"])
 
 
 def _voltage(change):

@@ -3,7 +3,7 @@
 import torch
 from sbi.utils import BoxUniform
 
-from sbi_active import GaussianNoise, SimulatorModel
+from sbi_active import SimulatorModel
 
 NOISE = 0.1
 PRIOR = BoxUniform(-3 * torch.ones(1), 3 * torch.ones(1))
@@ -11,7 +11,7 @@ PRIOR = BoxUniform(-3 * torch.ones(1), 3 * torch.ones(1))
 
 def model(fn=lambda theta, xi: theta * xi) -> SimulatorModel:
     """Return the slope, or another response, with the error of its sensor."""
-    return SimulatorModel(fn, noise=GaussianNoise(NOISE))
+    return SimulatorModel(fn, noise=NOISE)
 
 
 MODEL = model()

@@ -51,7 +51,7 @@ def test_equal_actions_with_other_inputs_are_simulated_apart():
     def summed(theta, action, *, inputs):
         return theta * inputs["u"].sum(1, keepdim=True) + action
 
-    model = SimulatorModel(summed, noise=GaussianNoise(0.1))
+    model = SimulatorModel(summed, noise=0.1)
     inputs = {"u": torch.tensor([[1.0, 2.0], [3.0, 4.0], [1.0, 2.0]])}
     given = {"inputs": inputs, "input_times": [0.0, 1.0]}
     trials = Trials(torch.zeros(3), torch.zeros(3), **given)
@@ -66,7 +66,7 @@ def test_a_function_of_one_row_gets_its_own_inputs():
         shapes.append((inputs["u"].shape, times.shape, input_times.shape, start.shape))
         return theta * inputs["u"].sum() + start[0]
 
-    model = SimulatorModel(one, noise=GaussianNoise(0.1), batched=False)
+    model = SimulatorModel(one, noise=0.1, batched=False)
     trials = Trials(
         None,
         torch.zeros(2, 1),
@@ -134,7 +134,7 @@ def two_sensors(theta, action, *, inputs, times):
 
 def test_sensors_have_effects_each_for_itself():
     prior = BoxUniform(torch.ones(1), 3 * torch.ones(1))
-    model = SimulatorModel(two_sensors, noise=GaussianNoise([0.05, 0.2]))
+    model = SimulatorModel(two_sensors, noise=[0.05, 0.2])
     gen = torch.Generator().manual_seed(0)
     u = torch.randn(6, 20, generator=gen).double().cumsum(1)
     times, truth = torch.arange(20).double(), torch.tensor([[2.0]]).double()

@@ -5,7 +5,7 @@ import pytest
 import torch
 from sbi.utils import BoxUniform
 
-from sbi_active import DiscreteActions, GaussianNoise, SimulatorModel
+from sbi_active import DiscreteActions, SimulatorModel
 from sbi_active.criticism import (
     AugmentedSimulator,
     Criticism,
@@ -25,7 +25,7 @@ def response(theta, action, cubic=0.0):
     return (theta[:, 0] * xi + theta[:, 1] * xi**2 + cubic * xi**3)[:, None]
 
 
-MODEL = SimulatorModel(response, noise=GaussianNoise(NOISE), parameter_names=["a", "b"])
+MODEL = SimulatorModel(response, noise=NOISE, parameter_names=["a", "b"])
 
 
 CUBIC = Effect.keyword("cubic", prior=normal(0.5))
@@ -76,7 +76,7 @@ def test_hidden_effects_are_named_and_measured(name):
 def test_drift_is_bias_and_slope_where_actions_run_in_order():
     action = torch.linspace(-2, 2, 9)
     line = SimulatorModel(
-        lambda theta, xi: theta[:, :1] + theta[:, 1:] * xi, noise=GaussianNoise(NOISE)
+        lambda theta, xi: theta[:, :1] + theta[:, 1:] * xi, noise=NOISE
     )
     trials = Trials(action, action)
     tracing = Criticism(line, PRIOR, trials, effects=[DRIFT], actions=ACTIONS).trace()
@@ -119,7 +119,7 @@ def test_trajectories_with_their_own_stamps_and_correlated_errors():
     def decay(theta, action):
         return action * torch.exp(-theta[:, :1] * times.to(theta))
 
-    model = SimulatorModel(decay, noise=GaussianNoise(0.05), sample_times=times)
+    model = SimulatorModel(decay, noise=0.05, sample_times=times)
     prior = BoxUniform(torch.tensor([0.2]), torch.tensor([3.0]))
     gen = torch.Generator().manual_seed(0)
     action = torch.tensor([1.0, -1.0, 2.0, -2.0, 1.5])
@@ -176,12 +176,10 @@ def both(theta, action):
     return torch.cat([response(theta, action), 10 * action], 1)
 
 
-TWO = SimulatorModel(
-    both, noise=GaussianNoise(NOISE), channel_names=["rail [m]", "swing"]
-)
+TWO = SimulatorModel(both, noise=NOISE, channel_names=["rail [m]", "swing"])
 TIMED = SimulatorModel(
     lambda theta, action: theta[:, :1] * torch.linspace(0, 1, 5).to(theta),
-    noise=GaussianNoise(NOISE),
+    noise=NOISE,
     sample_times=torch.linspace(0, 1, 5),
 )
 LABELS = ["swing [rad]", "rail [m]"]

@@ -21,7 +21,7 @@ def response(theta, action, quadratic=0.0):
     return x[:, None]
 
 
-MODEL = SimulatorModel(response, noise=GaussianNoise(1.0))
+MODEL = SimulatorModel(response, noise=1.0)
 QUADRATIC = Effect.keyword("quadratic", prior=normal())
 
 

@@ -4,7 +4,6 @@ import torch
 from sbi_active import (
     BoxActions,
     DiscreteActions,
-    GaussianNoise,
     InformationGainDesigner,
     MixedActions,
     RandomDesigner,
@@ -77,7 +76,7 @@ def test_auto_goes_by_what_is_known_of_the_noise():
         assert design.action.tolist() == [2.0]
         return design
 
-    one = SimulatorModel(lambda t, a: a * t[:, :1], noise=GaussianNoise(1.0))
+    one = SimulatorModel(lambda t, a: a * t[:, :1], noise=1.0)
     assert used(None, one).estimator == "EntropyGain"
     two = used(None, MODEL)
     assert (two.estimator, two.bound, two.notes) == ("NestedGain", "none", ())
@@ -98,7 +97,7 @@ def test_auto_goes_by_what_is_known_of_the_noise():
 
 def test_a_mean_that_changes_from_run_to_run_is_a_draw():
     """Declared noise beside noise inside: the declaration is not the whole noise."""
-    model = SimulatorModel(simulator, noise=GaussianNoise(0.01))
+    model = SimulatorModel(simulator, noise=0.01)
     design = InformationGainDesigner(ACTIONS).select(None, model, belief=PRIOR, seed=0)
     assert design.estimator == "EntropyGain"
     require_near(design, information(VALUES[:, None]), 0.1)
@@ -163,7 +162,7 @@ def test_regret_on_the_numerical_task(variant, trials):
 # Costs, constraints, exclusion, chance and given simulations
 
 
-MODEL = SimulatorModel(lambda theta, action: action * theta, noise=GaussianNoise(1.0))
+MODEL = SimulatorModel(lambda theta, action: action * theta, noise=1.0)
 BOX = BoxActions(0.0, 2.0, names=["push"], units=["m/s"])
 
 

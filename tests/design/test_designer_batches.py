@@ -9,7 +9,6 @@ from torch.distributions import MultivariateNormal, Normal
 from sbi_active import (
     AutocorrelatedNoise,
     DiscreteActions,
-    GaussianNoise,
     InformationGainDesigner,
     SimulatorModel,
 )
@@ -37,7 +36,7 @@ def joint(*actions):
     return 0.5 * float(torch.logdet(torch.eye(2).double() + h.T @ h))
 
 
-MODEL = SimulatorModel(along, noise=GaussianNoise(1.0))
+MODEL = SimulatorModel(along, noise=1.0)
 
 
 def select(simulator=MODEL, **options):
@@ -109,7 +108,7 @@ def exact(action: float, sd: float) -> float:
 
 
 def test_a_linear_model_tells_what_it_tells_in_closed_form():
-    model = SimulatorModel(line, noise=GaussianNoise(2.0))
+    model = SimulatorModel(line, noise=2.0)
     actions = DiscreteActions([0.2, 1.0, 3.0])
     designer = InformationGainDesigner(actions, num_samples=1_000)
     design = designer.select(None, model, belief=BELIEF, seed=0)

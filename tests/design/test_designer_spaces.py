@@ -40,7 +40,7 @@ def test_regret_on_the_numerical_task():
 def test_which_search():
     lists = MixedActions(DiscreteActions([1.0, 2.0]), DiscreteActions([0.0, 1.0]))
     designer = InformationGainDesigner(lists, num_samples=100)
-    model = SimulatorModel(lambda t, a: a[:, :1] * t, noise=GaussianNoise(1.0))
+    model = SimulatorModel(lambda t, a: a[:, :1] * t, noise=1.0)
     design = designer.select(None, model, belief=PRIOR, seed=0)
     assert design.candidates.shape == (4, 2)
     assert float(design.action[0]) == 2.0
@@ -70,7 +70,7 @@ class Twice(Search):
 
 def test_evaluations_share_parameters_and_noise_from_call_to_call():
     search = Twice()
-    model = SimulatorModel(lambda t, a: a * t[:, :1], noise=GaussianNoise(1.0))
+    model = SimulatorModel(lambda t, a: a * t[:, :1], noise=1.0)
     designer = InformationGainDesigner(BOX, search=search, num_samples=200)
     design = designer.select(None, model, belief=PRIOR, seed=0)
     first, second = search.found
@@ -88,7 +88,7 @@ def test_slopes_in_a_search_leave_its_finalists_simulations():
     def swing(theta, action):
         return 2 * torch.sin(3 * action[:, :1] * (theta @ weight))
 
-    model = SimulatorModel(swing, noise=GaussianNoise(0.05))
+    model = SimulatorModel(swing, noise=0.05)
     designer = InformationGainDesigner(BOX, num_samples=64, estimator="nested")
     design = designer.select(None, model, belief=prior, seed=0)
     assert design.expected_information_gain.isfinite().all()

@@ -14,7 +14,7 @@ from sbi_active.design import EntropyGain, NestedGain, PosteriorGain
 from sbi_active.design.estimators.base import CandidateSimulations, standard_error
 from sbi_active.design.estimators.posterior import ParameterGain
 from sbi_active.seeding import row_normals
-from sbi_active.simulation import GaussianNoise, MissingRowsWarning, SimulatorModel
+from sbi_active.simulation import MissingRowsWarning, SimulatorModel
 from tests import linear_gaussian
 from tests.design import test_designer as pushes
 from tests.design.fragile import ACTIONS, NOISE, PRIOR, Fragile
@@ -207,7 +207,7 @@ def test_a_rare_fault_stops_no_design(declared):
     def noisy(theta, action):
         return fails(theta, action) + torch.randn_like(theta)
 
-    model = SimulatorModel(fails, noise=GaussianNoise(1.0)) if declared else noisy
+    model = SimulatorModel(fails, noise=1.0) if declared else noisy
     designer = InformationGainDesigner(DiscreteActions([1.0, 1.1]), num_samples=400)
     lost = []
     for seed in range(3):

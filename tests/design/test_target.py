@@ -11,7 +11,7 @@ import torch
 from sbi.utils import BoxUniform
 from torch.distributions import MultivariateNormal
 
-from sbi_active import DiscreteActions, GaussianNoise, InformationGainDesigner
+from sbi_active import DiscreteActions, InformationGainDesigner
 from sbi_active.criticism.effects.augmented import AugmentedSimulator
 from sbi_active.design.estimators.base import CandidateSimulations
 from sbi_active.design.estimators.posterior import ParameterGain
@@ -31,7 +31,7 @@ def one_at_a_time(theta, action):
 
 
 NAMES = ["mass", "friction"]
-MODEL = SimulatorModel(one_at_a_time, noise=GaussianNoise(1.0), parameter_names=NAMES)
+MODEL = SimulatorModel(one_at_a_time, noise=1.0, parameter_names=NAMES)
 
 
 def select(target, *, model=MODEL, belief=PRIOR, **options):
@@ -71,7 +71,7 @@ def test_a_function_of_an_effect():
 
 def test_a_failure_or_none():
     """The sign of theta: log 2 at most, and next to nothing from a weak action."""
-    model = SimulatorModel(lambda t, a: a * t, noise=GaussianNoise(1.0))
+    model = SimulatorModel(lambda t, a: a * t, noise=1.0)
     designer = InformationGainDesigner(DiscreteActions([0.1, 100.0]), num_samples=1_500)
     given = {"belief": ONE, "target": lambda theta: (theta[:, 0] > 0).float()}
     design = designer.select(None, model, **given, seed=0)

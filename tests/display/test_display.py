@@ -10,13 +10,7 @@ import torch
 from attrs import evolve
 from sbi.utils import BoxUniform
 
-from sbi_active import (
-    BoxActions,
-    Campaign,
-    DiscreteActions,
-    GaussianNoise,
-    SimulatorModel,
-)
+from sbi_active import BoxActions, Campaign, DiscreteActions, SimulatorModel
 from sbi_active.design.design import Design
 from sbi_active.display import Page, Section, Table
 from sbi_active.display.campaign_page import page as campaign_page
@@ -73,7 +67,7 @@ NAMES = ["cost [$] \x07", "half \ud800", "a$b$c\\frac{"]
 
 def test_any_name_can_be_drawn_and_read(tmp_path):
     named = {"parameter_names": NAMES, "channel_names": NAMES}
-    model = SimulatorModel(lambda t, a: t * a, noise=GaussianNoise(0.1), **named)
+    model = SimulatorModel(lambda t, a: t * a, noise=0.1, **named)
     prior = BoxUniform(torch.zeros(3), torch.ones(3))
     actions = DiscreteActions(torch.eye(3) + 1, names=NAMES, units=["$"] * 3)
     options = evolve(OPTIONS, network="on demand")

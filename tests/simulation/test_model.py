@@ -52,7 +52,7 @@ def noisy(theta, action, seeds):
 def model(request):
     batched = request.param == "batched"
     fn = line if batched else line_row
-    return SimulatorModel(fn, noise=GaussianNoise(0.1), batched=batched)
+    return SimulatorModel(fn, noise=0.1, batched=batched)
 
 
 def test_effects_are_numbers_or_one_a_row(model):
@@ -74,8 +74,8 @@ def test_effects_are_numbers_or_one_a_row(model):
     [
         SimulatorModel(noisy),
         SimulatorModel(noisy_row, batched=False),
-        SimulatorModel(noisy, noise=GaussianNoise(1.0)),
-        SimulatorModel(line_row, batched=False, noise=GaussianNoise(1.0)),
+        SimulatorModel(noisy, noise=1.0),
+        SimulatorModel(line_row, batched=False, noise=1.0),
     ],
 )
 def test_rows_depend_on_their_seeds_alone(model):
@@ -95,9 +95,9 @@ def test_a_random_function_has_no_mean():
     with pytest.raises(ValueError, match="expected a simulator with a noise model"):
         SimulatorModel(noisy).mean(THETA, ACTION)
     for model in (
-        SimulatorModel(noisy, noise=GaussianNoise(1.0)),
-        SimulatorModel(noisy_row, batched=False, noise=GaussianNoise(1.0)),
-        SimulatorModel(lambda t, a: torch.randn_like(t), noise=GaussianNoise(1.0)),
+        SimulatorModel(noisy, noise=1.0),
+        SimulatorModel(noisy_row, batched=False, noise=1.0),
+        SimulatorModel(lambda t, a: torch.randn_like(t), noise=1.0),
     ):
         assert not model.is_deterministic(THETA, ACTION)
         with pytest.raises(ValueError, match="got different outputs from two seeds"):
@@ -132,7 +132,7 @@ def test_rows_that_raise_do_not_hide_whether_the_others_are_random(sd):
             raise FloatingPointError("unstable")
         return theta + sd * rng.normal(size=2)
 
-    model = SimulatorModel(unstable, batched=False, noise=GaussianNoise(1.0))
+    model = SimulatorModel(unstable, batched=False, noise=1.0)
     assert model.is_deterministic(THETA, ACTION) == (sd == 0)
     with pytest.raises(FloatingPointError, match="unstable"):
         SimulatorModel(unstable, batched=False).is_deterministic(THETA[1:2], ACTION[:1])

@@ -7,7 +7,6 @@ from sbi_active import (
     BoxActions,
     Campaign,
     CampaignOptions,
-    GaussianNoise,
     MixtureDensity,
     SimulatorModel,
 )
@@ -34,7 +33,7 @@ def drawn(theta, action):
     return mean(theta, action) + 0.1 * torch.randn(len(theta), 4)
 
 
-MODEL = SimulatorModel(mean, noise=GaussianNoise(0.1), parameter_names=["a", "b"])
+MODEL = SimulatorModel(mean, noise=0.1, parameter_names=["a", "b"])
 
 
 def outcome(action, index):

@@ -5,7 +5,7 @@ import torch
 from sbi.utils import BoxUniform
 from torch.distributions import HalfNormal, Independent, Normal
 
-from sbi_active import DiscreteActions, GaussianNoise, SimulatorModel
+from sbi_active import DiscreteActions, SimulatorModel
 from sbi_active.criticism import (
     AugmentedSimulator,
     Context,
@@ -25,7 +25,7 @@ def line(theta, action, curvature=0.0):
     return (theta[:, 0] + theta[:, 1] * xi + curvature * xi**2)[:, None]
 
 
-MODEL = SimulatorModel(line, noise=GaussianNoise(0.1), parameter_names=["a", "b"])
+MODEL = SimulatorModel(line, noise=0.1, parameter_names=["a", "b"])
 
 
 HOOKS = {

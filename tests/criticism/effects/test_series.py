@@ -7,7 +7,7 @@ import pytest
 import torch
 from sbi.utils import BoxUniform
 
-from sbi_active import GaussianNoise, SimulatorModel
+from sbi_active import SimulatorModel
 from sbi_active.criticism import Trials, close_loop, varying_parameters
 from sbi_active.criticism.effects import changes
 from sbi_active.criticism.effects.first_samples import start_from_first_samples
@@ -202,9 +202,7 @@ def stopping(theta, action):
     return torch.cat([way, action / (9.81 * friction) + delay], 1)
 
 
-STOPPING = SimulatorModel(
-    stopping, noise=GaussianNoise(0.003), parameter_names=["friction", "delay"]
-)
+STOPPING = SimulatorModel(stopping, noise=0.003, parameter_names=["friction", "delay"])
 
 
 def trials_of(friction):

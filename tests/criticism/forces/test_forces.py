@@ -7,7 +7,7 @@ import pytest
 import torch
 from sbi.utils import BoxUniform
 
-from sbi_active import GaussianNoise, SimulatorModel
+from sbi_active import SimulatorModel
 from sbi_active.criticism import Criticism, Trials
 from sbi_active.criticism.forces import force_effects, total_force
 from sbi_active.criticism.forces.dictionary import FORMS
@@ -34,7 +34,7 @@ def swing(theta, action, *, force=None):
     return torch.stack(found, 1).to(theta.dtype)
 
 
-MODEL = SimulatorModel(swing, noise=GaussianNoise(SD), batched=True, sample_times=TIMES)
+MODEL = SimulatorModel(swing, noise=SD, batched=True, sample_times=TIMES)
 
 
 @dataclass(frozen=True)
@@ -95,7 +95,7 @@ def test_a_simulator_that_never_asks_is_refused():
     def fn(theta, action, *, force=None):
         return swing(theta, action)
 
-    deaf = SimulatorModel(fn, noise=GaussianNoise(SD), sample_times=TIMES)
+    deaf = SimulatorModel(fn, noise=SD, sample_times=TIMES)
     with pytest.raises(ValueError, match="call total_force"):
         force_effects(deaf, PRIOR, measured())
 

@@ -7,11 +7,12 @@ from scipy.special import logsumexp
 from scipy.stats import multivariate_normal, norm, t
 from torch.distributions import Independent, Normal, Uniform
 
-from sbi_active import GaussianNoise, SimulatorModel, StudentTNoise
+from sbi_active import SimulatorModel, StudentTNoise
 from sbi_active.criticism import Criticism, Trials
 from sbi_active.criticism.linear.screening import linear_models
 from sbi_active.criticism.misfit.verdict import judge
 from sbi_active.criticism.results import SCATTER, UNEXPLAINED, ModelKey
+from sbi_active.criticism.rivals import heavy_tails
 from sbi_active.criticism.rivals.rival_set import RivalSet
 from sbi_active.criticism.steps.detection import credible_set
 from tests.criticism.misfit import oscillator
@@ -113,7 +114,7 @@ def test_which_trials_have_an_outcome_tells_of_parameters_and_effects():
         x = curve(theta, action)
         return torch.where(x > 1.0, torch.nan, x)
 
-    model = SimulatorModel(ends, noise=GaussianNoise(SD))
+    model = SimulatorModel(ends, noise=SD)
     x = measured(seed=2)
     x[curve(TRUTH, ACTION) > 1.0] = torch.nan
     right = verdict_of(model, x)
@@ -129,8 +130,7 @@ def test_which_trials_have_an_outcome_tells_of_parameters_and_effects():
 
 def test_jumps_count_as_noise_and_an_effect_beside_them_is_named():
     model = SimulatorModel(
-        lambda theta, xi: torch.round(curve(theta, xi) / 0.4) * 0.4,
-        noise=GaussianNoise(0.05),
+        lambda theta, xi: torch.round(curve(theta, xi) / 0.4) * 0.4, noise=0.05
     )
     x = torch.round((measured() + 1.5 * (3 * ACTION).sin()) / 0.4) * 0.4
     loop = Criticism(model, PRIOR, Trials(ACTION, x), effects=EFFECTS)
@@ -214,6 +214,27 @@ def test_what_is_undeclared_beside_heavy_tails_is_no_scatter():
     assert found.key == ModelKey(error=UNEXPLAINED)
     joint = found.states.joint(BARE)
     assert joint[found.key] > joint[ModelKey(error=SCATTER)] + 10
+
+
+def test_gaussians_touch_the_density_from_below():
+    for at in (0.0, 0.7, 6.0):
+        errors = np.append(np.linspace(-9, 9, 101), at)
+        weight, peak = heavy_tails.tangent(np.array(at), DF)
+        below = peak - 0.5 * (weight * errors) ** 2
+        density = heavy_tails.student(errors, DF)
+        assert (below <= density + 1e-12).all()
+        assert below[-1] == pytest.approx(density[-1])
+
+
+def test_squares_of_signed_deviances_are_what_log_densities_lose():
+    errors = np.array([-1e8, -3.0, 0.0, 1e-6, 2.0])
+    found = heavy_tails.signed_deviance(errors, DF)
+    lost = heavy_tails.student(np.zeros(5), DF) - heavy_tails.student(errors, DF)
+    assert 0.5 * found**2 == pytest.approx(lost)
+    assert heavy_tails.from_deviance(found, DF) == pytest.approx(errors)
+    slope = (heavy_tails.signed_deviance(errors + 1e-4, DF) - found)[1:] / 1e-4
+    own = heavy_tails.deviance_slope(errors, DF)[1:]
+    assert own == pytest.approx(slope, rel=1e-3)
 
 
 @pytest.mark.parametrize("far", [0.0, 30.0])

@@ -6,7 +6,7 @@ import torch
 from sbi.utils import BoxUniform
 from torch.distributions import Independent, Uniform
 
-from sbi_active import GaussianNoise, SimulatorModel
+from sbi_active import SimulatorModel
 from sbi_active.criticism import Criticism, Trials
 from sbi_active.criticism.linear import screening
 from sbi_active.criticism.linear.fits import FitSettings
@@ -44,7 +44,7 @@ def searched(**settings):
     drift = SLOPE * torch.arange(NUM_TRIALS)[:, None]
     x = curve(theta, action).clamp(-LIMIT, LIMIT) + drift
     x = x + SENSOR * torch.randn(x.shape, generator=generator)
-    model = SimulatorModel(curve, noise=GaussianNoise(SENSOR))
+    model = SimulatorModel(curve, noise=SENSOR)
     prior = BoxUniform(-5 * torch.ones(2), 5 * torch.ones(2))
     loop = Criticism(model, prior, Trials(action, x), effects=EFFECTS, seed=0)
     search = Search(loop.rivals, FitSettings(**settings))
@@ -71,7 +71,7 @@ def test_at_a_bound_the_slope_is_from_within():
     def saturating(theta, xi):
         return torch.tanh(0.1 * xi * theta[:, :1] * theta[:, 1:])
 
-    model = SimulatorModel(saturating, noise=GaussianNoise(1e-6))
+    model = SimulatorModel(saturating, noise=1e-6)
     prior = BoxUniform(torch.tensor([1.0, 0.5]), torch.tensor([20.0, 2.0]))
     xi, unit = torch.linspace(0.5, 1.5, 8)[:, None], np.full(8, 1e-6)
     trials = Trials(xi, torch.tanh(0.99 * xi))
@@ -113,7 +113,7 @@ def pattern(k):
 
 def loop_of(number, strength, *more):
     rng = np.random.default_rng(7)
-    model = SimulatorModel(series, noise=GaussianNoise(0.05))
+    model = SimulatorModel(series, noise=0.05)
     action = torch.tensor([[0.5], [1.0], [1.5]])
     x = series(torch.tensor([[0.7]]), action) + strength * torch.cos(6 * TIMES)
     x = x + 0.05 * torch.from_numpy(rng.standard_normal(x.shape)).float()

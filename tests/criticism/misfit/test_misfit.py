@@ -5,7 +5,7 @@ import pytest
 import torch
 from torch.distributions import Normal
 
-from sbi_active import GaussianNoise, SimulatorModel
+from sbi_active import SimulatorModel
 from sbi_active.criticism import Criticism, Effect, Trials, close_loop
 from sbi_active.criticism.linear.screening import linear_models
 from sbi_active.criticism.misfit import record
@@ -105,7 +105,7 @@ def test_held_out_errors_are_told_number_by_number_as_left_out_ones_are():
     x = x + unit * (0.8 * action**2 + 0.4 * torch.sin(4 * action))
     x = x + 0.05 * unit * torch.randn(x.shape, generator=gen)
     own = Trials(action, x, role=["fit"] * 16 + ["held out"] * 8)
-    model = SimulatorModel(both, noise=GaussianNoise(0.05 * unit))
+    model = SimulatorModel(both, noise=0.05 * unit)
     curve = added("curve", lambda xi: xi**2 * unit)
     for found in loop(own, [curve], model, prior=WIDE).trace().misfit.models:
         held_out = found.held_out / unit.numpy()

@@ -78,9 +78,7 @@ def test_what_is_asked_first_does_not_matter():
 
 def test_likely_models_that_bend_have_samples_of_their_posterior():
     """Of two gains in a row trials tell the product, on a hyperbola."""
-    model = SimulatorModel(
-        lambda theta, a: theta.prod(1, keepdim=True) * a, noise=GaussianNoise(0.5)
-    )
+    model = SimulatorModel(lambda theta, a: theta.prod(1, keepdim=True) * a, noise=0.5)
     action = torch.linspace(-1, 3, 8, dtype=torch.float64)[:, None]
     error = torch.as_tensor(np.random.default_rng(4).standard_normal((8, 1)))
     trials = Trials(action, 4 * action + 2 + 0.5 * error)
@@ -131,7 +129,7 @@ def test_outcomes_are_told_however_large_the_library():
     action = torch.linspace(-2, 2, 20, dtype=torch.float64)[:, None]
     error = torch.randn(20, 1, generator=torch.manual_seed(0)).double()
     trials = Trials(action, seen(2.0, action + 0.4 * torch.cos(3 * action)) + error / 9)
-    model = SimulatorModel(seen, noise=GaussianNoise(1 / 9))
+    model = SimulatorModel(seen, noise=1 / 9)
     prior = BoxUniform(torch.zeros(1), 5 * torch.ones(1))
     loop = Criticism(model, prior, trials, effects=effects)
     assert loop.rivals.can_fail

@@ -8,7 +8,7 @@ import torch
 from sbi.utils import BoxUniform
 from torch.distributions import Independent, Normal
 
-from sbi_active import GaussianNoise, SimulatorModel
+from sbi_active import SimulatorModel
 from sbi_active.criticism import Criticism, Effect, Trials
 from sbi_active.criticism.misfit.contrary import beyond_bounds
 from sbi_active.criticism.results import NONE, UNEXPLAINED
@@ -25,7 +25,7 @@ def slide(theta, action, **effects):
 def criticism(prior, *, effect=GAIN, fn=stop, drag=0.0):
     times = TIMES if fn is slide else None
     given = {"parameter_names": ["friction"], "sample_times": times}
-    model = SimulatorModel(fn, noise=GaussianNoise(SENSOR), **given)
+    model = SimulatorModel(fn, noise=SENSOR, **given)
     trials = Trials(SPEEDS, slid(drag, fn), role=ROLE, sample_times=times)
     return Criticism(model, prior, trials, effects=[effect], seed=0)
 

@@ -8,7 +8,7 @@ import torch
 from sbi.utils import BoxUniform
 from scipy.stats import entropy
 
-from sbi_active import DiscreteActions, GaussianNoise, SimulatorModel
+from sbi_active import DiscreteActions, SimulatorModel
 from sbi_active.criticism import Criticism, Trials, generic_effects, next_action
 from sbi_active.criticism.next_action import (
     beyond_range,
@@ -206,7 +206,7 @@ def truth(action):
 @pytest.fixture(scope="module")
 def aliased():
     names = ["length", "damping"]
-    model = SimulatorModel(pendulum, noise=GaussianNoise(FINE), parameter_names=names)
+    model = SimulatorModel(pendulum, noise=FINE, parameter_names=names)
     prior = BoxUniform(torch.tensor([0.3, 0.0]), torch.tensor([2.0, 1.0]))
     generator = torch.Generator().manual_seed(1)
     action = ANGLES.values[torch.randperm(11, generator=generator)[:8]]

@@ -6,7 +6,7 @@ import pytest
 import torch
 from sbi.utils import BoxUniform
 
-from sbi_active import DiscreteActions, GaussianNoise, SimulatorModel
+from sbi_active import DiscreteActions, SimulatorModel
 from sbi_active.criticism import Trials, close_loop, generic_effects
 from sbi_active.criticism.report.gate import EXIT_CODES
 from tests.criticism import block
@@ -91,10 +91,7 @@ def test_trajectories_that_tell_a_product_alone_are_not_identifiable():
         return xi * torch.cos(rate * times.to(theta))
 
     model = SimulatorModel(
-        swing,
-        noise=GaussianNoise(1e-3),
-        parameter_names=["stiffness", "factor"],
-        sample_times=times,
+        swing, noise=1e-3, parameter_names=["stiffness", "factor"], sample_times=times
     )
     prior = BoxUniform(torch.tensor([1.0, 0.5]), torch.tensor([20.0, 2.0]))
     gen, xi = torch.Generator().manual_seed(0), torch.linspace(0.5, 1.5, 8)[:, None]
@@ -110,7 +107,7 @@ def test_trajectories_that_tell_a_product_alone_are_not_identifiable():
 
 
 def test_three_trials_of_which_one_contradicts():
-    model = SimulatorModel(block.stop, noise=GaussianNoise(block.SENSOR))
+    model = SimulatorModel(block.stop, noise=block.SENSOR)
     prior, trials = block.friction(0.1), Trials([1.0, 2.0, 3.0], [0.127, 0.510, 2.3])
     effects = generic_effects(model, trials, prior=prior)
     gate = close_loop(model, prior, trials, effects=effects, plan=False).gate

@@ -137,7 +137,7 @@ def shear(theta, action):
     return torch.cat([theta[:, :1], theta[:, 1:] + rough], 1)
 
 
-SHEAR = SimulatorModel(shear, noise=GaussianNoise(SD))
+SHEAR = SimulatorModel(shear, noise=SD)
 
 
 def test_where_the_emulator_misses_slopes_of_the_simulator_count():

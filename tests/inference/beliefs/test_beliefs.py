@@ -10,7 +10,7 @@ from sbi.utils.torchutils import set_validate_args
 from torch import distributions as dist
 from torch.distributions.transforms import AffineTransform, ExpTransform
 
-from sbi_active import BoxActions, Campaign, GaussianNoise, SimulatorModel
+from sbi_active import BoxActions, Campaign, SimulatorModel
 from sbi_active.inference import refine
 from sbi_active.inference.beliefs.diagnostics import Assumption, Diagnostics
 from sbi_active.inference.beliefs.enumerated import EnumeratedBelief
@@ -74,9 +74,7 @@ def exact():
     return log_mass.flatten().softmax(0), float(log_evidence)
 
 
-@pytest.mark.parametrize(
-    "simulator", [SimulatorModel(line, noise=GaussianNoise(SD)), drawn]
-)
+@pytest.mark.parametrize("simulator", [SimulatorModel(line, noise=SD), drawn])
 def test_values_get_their_probabilities(simulator):
     belief = refine(simulator, PRIOR, ACTION, X, seed=0)
     assert isinstance(belief, EnumeratedBelief)
@@ -110,7 +108,7 @@ def test_noise_is_not_inflated_for_a_value_that_trials_rule_out():
     prior = MultipleIndependent(parts, validate_args=False)
     action = torch.tensor([[1.0], [1.0], [-1.0], [-1.0]])
     x = 0.5 * action + 3 + torch.tensor([[0.1], [-0.1], [0.1], [-0.1]])
-    model = SimulatorModel(offset, noise=GaussianNoise(SD))
+    model = SimulatorModel(offset, noise=SD)
     belief = refine(model, prior, action, x, seed=0)
     # Off, they miss by ten deviations each: e^-200, whatever the prior.
     assert belief.probability.tolist() == pytest.approx([0.0, 1.0], abs=1e-9)
@@ -118,7 +116,7 @@ def test_noise_is_not_inflated_for_a_value_that_trials_rule_out():
 
 
 def test_a_campaign_designs_and_comes_back(tmp_path):
-    model = SimulatorModel(line, noise=GaussianNoise(SD))
+    model = SimulatorModel(line, noise=SD)
     sizes = {"num_samples": 100, "num_scored": 100}
     given = {"directory": tmp_path / "campaign", "options": sizes}
     campaign = Campaign(model, PRIOR, [0.5, 1.0, 2.0], **given)
@@ -178,7 +176,7 @@ def scaled(theta, action):
 
 
 def campaign(prior: dist.Distribution, network: str = "on demand") -> Campaign:
-    model = SimulatorModel(scaled, noise=GaussianNoise(0.2))
+    model = SimulatorModel(scaled, noise=0.2)
     options = {"num_simulations": 300, "num_samples": 100, "num_scored": 100}
     options |= {"network": network}
     return Campaign(model, prior, BoxActions([0.5], [2.0]), options=options)
@@ -224,7 +222,7 @@ def test_a_belief_is_the_prior_of_the_next_campaign():
     def slide(theta, action):
         return action**2 / (2 * 9.81 * theta)
 
-    model = SimulatorModel(slide, noise=GaussianNoise(0.02))
+    model = SimulatorModel(slide, noise=0.02)
     prior = BoxUniform(torch.tensor([0.2]), torch.tensor([1.0]))
     rest = {"seed": 0, "options": {"network": "on demand"}}
     belief, both = prior, Campaign(model, prior, BoxActions([0.5], [3.0]), **rest)

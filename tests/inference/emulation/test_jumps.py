@@ -36,7 +36,7 @@ def belief_of(response, seed, num=300):
     def fn(theta, xi):
         return theta[:, :1] * xi + 3 * response(theta[:, 1:] - EDGE)
 
-    simulator = SimulatorModel(fn, noise=GaussianNoise(0.1))
+    simulator = SimulatorModel(fn, noise=0.1)
     prior = BoxUniform(-torch.ones(2), torch.ones(2))
     options = CampaignOptions(max_simulations=num, planned_trials=2, refinement=FEW)
     given = {"options": options, "seed": seed}
