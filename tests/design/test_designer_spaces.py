@@ -113,7 +113,7 @@ def test_a_search_for_a_parameter_sees_it_by_few_simulations():
 
 def test_an_estimate_by_too_few_outcomes_is_said_to_be_one():
     model = SimulatorModel(simulator, parameter_names=("a", "b"))
-    designer = InformationGainDesigner(DiscreteActions([1.0, 2.0]), num_samples=16)
+    designer = InformationGainDesigner([1.0, 2.0], num_samples=16)
     design = designer.select(None, model, belief=PRIOR, target="a", seed=0)
     assert any("outcomes of an action; raise num_samples" in n for n in design.notes)
 

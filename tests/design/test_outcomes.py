@@ -175,7 +175,7 @@ def test_a_measurement_that_is_too_improbable_excludes_an_action():
     assert safe.expected_information_gain.isfinite().all()
     (note,) = safe.notes
     assert note.startswith("1 of 4 candidates excluded: a measurement is less probable")
-    only_hard = InformationGainDesigner(DiscreteActions([1.5, 2.0]), **sizes)
+    only_hard = InformationGainDesigner([1.5, 2.0], **sizes)
     with pytest.raises(ValueError, match=r"at least 0.9; got 0\.5\d* at most"):
         only_hard.select(Model(), falls_off, min_probability_valid=0.9, seed=0)
 
@@ -208,7 +208,7 @@ def test_a_rare_fault_stops_no_design(declared):
         return fails(theta, action) + torch.randn_like(theta)
 
     model = SimulatorModel(fails, noise=1.0) if declared else noisy
-    designer = InformationGainDesigner(DiscreteActions([1.0, 1.1]), num_samples=400)
+    designer = InformationGainDesigner([1.0, 1.1], num_samples=400)
     lost = []
     for seed in range(3):
         with warnings.catch_warnings():

@@ -72,7 +72,7 @@ def test_a_function_of_an_effect():
 def test_a_failure_or_none():
     """The sign of theta: log 2 at most, and next to nothing from a weak action."""
     model = SimulatorModel(lambda t, a: a * t, noise=1.0)
-    designer = InformationGainDesigner(DiscreteActions([0.1, 100.0]), num_samples=1_500)
+    designer = InformationGainDesigner([0.1, 100.0], num_samples=1_500)
     given = {"belief": ONE, "target": lambda theta: (theta[:, 0] > 0).float()}
     design = designer.select(None, model, **given, seed=0)
     weak, strong = design.expected_information_gain.tolist()

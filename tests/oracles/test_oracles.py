@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import torch
 
-from sbi_active import Campaign, DiscreteActions, RefinementOptions
+from sbi_active import Campaign, RefinementOptions
 from sbi_active.inference import refine
 from sbi_active.inference.declared.refining import SimulatedBelief
 from tests.oracles import controls
@@ -116,7 +116,7 @@ def test_a_parameter_that_no_trial_informs_changes_nothing():
 def test_a_discrete_parameter_gets_its_probability():
     own = PROBLEMS["payload"]()
     simulator = own.simulator(is_declared=True)
-    campaign = Campaign(simulator, own.prior, DiscreteActions([3.0]))
+    campaign = Campaign(simulator, own.prior, [3.0])
     campaign.attach([3.0], torch.from_numpy(own.x[0]).float())
     is_on = campaign.update().sample((4_000,))[:, 1] > 0.5
     assert float(is_on.double().mean()) == pytest.approx(

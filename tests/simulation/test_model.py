@@ -10,7 +10,6 @@ from sbi.utils import BoxUniform
 
 from sbi_active import (
     Campaign,
-    DiscreteActions,
     GaussianNoise,
     InformationGainDesigner,
     RandomDesigner,
@@ -255,7 +254,7 @@ def pairs(theta, action):
 def test_a_number_for_each_pair_of_rows_is_refused_at_once(wrap):
     prior = BoxUniform(torch.zeros(2), torch.ones(2))
     with pytest.raises(ValueError, match="index both alike"):
-        Campaign(wrap(pairs), prior, DiscreteActions([1.0, 2.0]))
+        Campaign(wrap(pairs), prior, [1.0, 2.0])
 
 
 def test_one_number_a_row_needs_no_axis():
@@ -267,7 +266,7 @@ def test_one_number_a_row_needs_no_axis():
         ones = torch.ones(num_rows, 1)
         assert model.mean(ones, ones).shape == (num_rows, 1)
     prior = BoxUniform(torch.zeros(1), torch.ones(1))
-    assert Campaign(model, prior, DiscreteActions([1.0])).x_shape == (1,)
+    assert Campaign(model, prior, [1.0]).x_shape == (1,)
 
 
 def test_counts_that_are_equal_by_chance_prove_no_missing_noise():

@@ -34,7 +34,7 @@ def swing(theta, action, *, force=None):
     return torch.stack(found, 1).to(theta.dtype)
 
 
-MODEL = SimulatorModel(swing, noise=SD, batched=True, sample_times=TIMES)
+MODEL = SimulatorModel(swing, noise=SD, sample_times=TIMES)
 
 
 @dataclass(frozen=True)

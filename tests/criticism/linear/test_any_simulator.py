@@ -257,7 +257,7 @@ def test_a_trial_in_other_units_is_an_outlier_beside_heavy_tails():
     own.x[5] /= 100  # metres for centimetres
     noise = StudentTNoise(oscillator.SENSOR, 4.0)
     model = SimulatorModel(
-        oscillator.oscillate, noise=noise, batched=True, sample_times=oscillator.TIMES
+        oscillator.oscillate, noise=noise, sample_times=oscillator.TIMES
     )
     found = Criticism(model, oscillator.PRIOR, own).trace()
     assert found.verdict == "outlier"

@@ -36,7 +36,7 @@ def oscillate(
     return torch.stack(found, 1).to(theta.dtype)
 
 
-MODEL = SimulatorModel(oscillate, noise=SENSOR, batched=True, sample_times=TIMES)
+MODEL = SimulatorModel(oscillate, noise=SENSOR, sample_times=TIMES)
 ACTION = torch.linspace(0.5, 2.0, NUM_TRIALS, dtype=torch.float64)[:, None]
 
 

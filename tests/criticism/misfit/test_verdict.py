@@ -171,10 +171,10 @@ def test_a_set_with_an_effect_on_the_noise_has_draws_for_the_next_action():
 def test_left_out_trials_of_a_few_that_scatter_have_errors_as_large():
     """Without one of seven trials the others may not show that they scatter."""
     covered = []
-    for seed in range(8):
+    for seed in range(6):
         loop = scattered(lambda action: 0.3, num=7, seed=seed)
         if loop.trace().verdict == "scatter":
             covered.append(loop.evaluate().after["coverage"].mean())
-    assert len(covered) >= 4
-    # Of 28 trials or more, with three standard errors; it was below .75.
+    assert len(covered) >= 3
+    # Of 21 trials or more, with three standard errors; it was below .75.
     assert np.mean(covered) >= 0.76

@@ -6,7 +6,7 @@ import pytest
 import torch
 from sbi.utils import BoxUniform
 
-from sbi_active import DiscreteActions, InformationGainDesigner, SimulatorModel
+from sbi_active import InformationGainDesigner, SimulatorModel
 from sbi_active.design import LikelihoodGain, LinearGain, PosteriorGain, RatioGain
 from sbi_active.design.estimators.automatic import choose_estimator, find_estimator
 from sbi_active.design.estimators.base import CandidateSimulations
@@ -126,7 +126,7 @@ def on_steps(num, dim):
     prior = BoxUniform(torch.zeros(dim), torch.ones(dim))
     noise = GaussianNoise(0.05)
     stairs = SimulatorModel(lambda theta, action: (num * theta).floor(), noise=noise)
-    designer = InformationGainDesigner(DiscreteActions([0.0, 1.0]), num_samples=750)
+    designer = InformationGainDesigner([0.0, 1.0], num_samples=750)
     return designer.select(None, stairs, belief=prior, seed=0)
 
 

@@ -12,7 +12,7 @@ from scipy.stats import norm
 from torch import Tensor
 from torch.distributions import Independent, LogNormal, Normal
 
-from sbi_active import Campaign, DiscreteActions, SimulatorModel
+from sbi_active import Campaign, SimulatorModel
 from sbi_active.inference import RefinementOptions, refine
 from sbi_active.inference.declared.refining import SimulatedBelief
 from sbi_active.inference.engine import SimulatedPotential, search
@@ -43,7 +43,7 @@ DECLARED = SimulatorModel(line, noise=SD)
 
 def after(trials, simulator=DECLARED, method="nsbi"):
     given = {"method": method, "options": OPTIONS}
-    c = Campaign(simulator, PRIOR, DiscreteActions([0.5, 1.0, 3.0]), **given)
+    c = Campaign(simulator, PRIOR, [0.5, 1.0, 3.0], **given)
     for action, x in trials:
         c.tell(x, action=[action])
     c.update()
