@@ -190,12 +190,12 @@ def test_friction_by_load_grows_with_the_force_of_the_motor():
         cart,
         {"rail.damping": (0.0, 0.1)},
         sensors=["rail"],
-        actions=BoxActions([0.0], [4.0], names=["push"]),
+        actions=BoxActions([-4.0], [4.0], names=["push"]),
         times=[0.5, 1.0],
         noise=0.01,
     )
     (effect,) = mjcf_effects(robot, include=["rail friction loss by load"])
-    push = {"action": [2.0, 4.0], "damping": 0.0}
+    push = {"action": [-2.0, 4.0], "damping": 0.0}
     free, held = run(robot, {}, **push), run(robot, {effect: [0.25]}, **push)
     # A quarter of the push is lost, however large it is.
     assert held / free == pytest.approx(0.75, abs=0.01)

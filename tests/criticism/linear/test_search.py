@@ -67,7 +67,7 @@ def test_no_pair_is_fitted_where_linear_evidence_puts_all_behind():
     assert max(len(key.effects) for key in search.found) == 1
 
 
-def test_at_a_bound_the_slope_is_from_within():
+def test_slopes_are_from_both_sides_and_at_a_bound_from_within():
     def saturating(theta, xi):
         return torch.tanh(0.1 * xi * theta[:, :1] * theta[:, 1:])
 
@@ -76,6 +76,11 @@ def test_at_a_bound_the_slope_is_from_within():
     xi, unit = torch.linspace(0.5, 1.5, 8)[:, None], np.full(8, 1e-6)
     trials = Trials(xi, torch.tanh(0.99 * xi))
     own = RivalSet(model, prior, trials, []).rival(ModelKey())
+    one_sided = linearize(own, own.coordinates.from_z(np.array([[9.0, 1.1]]))[0], unit)
+    models = one_sided, centered(own, one_sided, unit)
+    # What the trials tell of the direction that they tell least of, which is nothing.
+    told = [np.linalg.svd(m.jacobian, compute_uv=False)[-1] for m in models]
+    assert told[1] < 0.1 < 1 < told[0]
     for corner in (own.coordinates.low, own.coordinates.high):
         one_sided = linearize(own, corner, unit)
         both = centered(own, one_sided, unit)

@@ -134,6 +134,16 @@ def test_a_split_mixture_is_normalized_and_matches_its_draws():
         assert region(draws).mean() == pytest.approx(expected, abs=0.02)
 
 
+def test_a_singular_covariance_has_its_smallest_variances_raised():
+    covariance = np.array([[1.0, 1.0], [1.0, 1.0]])[None] - 1e-16
+    covariance = np.concatenate([covariance, [[[1.0, 2.0], [2.0, 1.0]]]])
+    factor = mixtures.lower_factors(covariance)
+    assert (np.triu(factor, 1) == 0).all()
+    assert (np.diagonal(factor, axis1=1, axis2=2) > 1e-7).all()
+    product = factor @ np.swapaxes(factor, 1, 2)
+    assert product[0] == pytest.approx(covariance[0], abs=1e-9)
+
+
 # Evidences and moments of densities whose integral is known
 
 
