@@ -243,16 +243,17 @@ finally:
 """
 
 
-@pytest.mark.parametrize(
-    ("arguments", "status", "text"),
-    [
-        (["--help"], 0, "Find what a simulator lacks"),
-        (["run", "-h"], 0, "[asbi|nsbi|alhi|nlhi|seqbed]"),
-        (["--version"], 0, __version__),
-        (["biuld"], 2, "No such command 'biuld'"),
-        (["run", "numerical", "--roundz", "3", "--out", "d"], 2, "option '--roundz'"),
-    ],
-)
+#: Words, exit status, and a part of what is shown.
+QUICK = [
+    (["--help"], 0, "Find what a simulator lacks"),
+    (["run", "-h"], 0, "[asbi|nsbi|alhi|nlhi|seqbed]"),
+    (["--version"], 0, __version__),
+    (["biuld"], 2, "No such command 'biuld'"),
+    (["run", "numerical", "--roundz", "3", "--out", "d"], 2, "option '--roundz'"),
+]
+
+
+@pytest.mark.parametrize(("arguments", "status", "text"), QUICK)
 def test_nothing_heavy_is_imported(arguments, status, text):
     words = [sys.executable, "-c", COMMAND, *arguments]
     done = subprocess.run(words, capture_output=True, text=True)
@@ -261,15 +262,16 @@ def test_nothing_heavy_is_imported(arguments, status, text):
     assert done.stdout.endswith("imported: []\n")
 
 
-@pytest.mark.parametrize(
-    ("line", "kind", "text"),
-    [
-        ("fly camp", "NoSuchCommand", "No such command 'fly'"),
-        ("ask camp --targt x", "NoSuchOption", "No such option '--targt'"),
-        ("status nowhere", "ValueError", "expected a campaign; got no nowhere"),
-        ("status \ud800", "UnicodeEncodeError", "surrogates not allowed"),
-    ],
-)
+#: Words, the kind of error, and a part of its text.
+SLIPS = [
+    ("fly camp", "NoSuchCommand", "No such command 'fly'"),
+    ("ask camp --targt x", "NoSuchOption", "No such option '--targt'"),
+    ("status nowhere", "ValueError", "expected a campaign; got no nowhere"),
+    ("status \ud800", "UnicodeEncodeError", "surrogates not allowed"),
+]
+
+
+@pytest.mark.parametrize(("line", "kind", "text"), SLIPS)
 def test_a_slip_is_json_as_well(line, kind, text, capfd):
     assert main([*line.split(), "--json"]) == 2
     shown = capfd.readouterr()

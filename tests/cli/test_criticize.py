@@ -86,15 +86,16 @@ def compared(monkeypatch):
     return calls
 
 
-@pytest.mark.parametrize(
-    ("rows", "options", "message"),
-    [
-        (["1,2"], OPTIONS, "at least two valid trials to fit; got 1"),
-        (["1,2", "2,3"], OPTIONS[:2], "at least 3 repeats of one action"),
-        (["1,2", "2,3"], [*OPTIONS[:2], "--noise", "0"], "expected --noise > 0"),
-        (["1,2", "2,3"], OPTIONS[2:], "expected --theta-low and --theta-high"),
-    ],
-)
+#: What lacks, and what is said of it.
+INCOMPARABLE = [
+    (["1,2"], OPTIONS, "at least two valid trials to fit; got 1"),
+    (["1,2", "2,3"], OPTIONS[:2], "at least 3 repeats of one action"),
+    (["1,2", "2,3"], [*OPTIONS[:2], "--noise", "0"], "expected --noise > 0"),
+    (["1,2", "2,3"], OPTIONS[2:], "expected --theta-low and --theta-high"),
+]
+
+
+@pytest.mark.parametrize(("rows", "options", "message"), INCOMPARABLE)
 def test_what_cannot_be_compared(rows, options, message, capsys):
     write(rows)
     assert run("--simulator", "my_robot:distance", *options) == 2

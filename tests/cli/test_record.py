@@ -23,15 +23,16 @@ def made(tmp_path_factory):
     return made_at(tmp_path_factory, TWO, "0.3", "0.6")
 
 
-@pytest.mark.parametrize(
-    "words",
-    [
-        "tell camp 0.4 0.8 --action 1.5 --trial 1 --json",
-        "correct camp 0 0.31 0.61 --reason typo",
-        "withdraw camp 1",
-        "status camp",
-    ],
-)
+#: Commands that read and write the log alone.
+LIGHT = [
+    "tell camp 0.4 0.8 --action 1.5 --trial 1 --json",
+    "correct camp 0 0.31 0.61 --reason typo",
+    "withdraw camp 1",
+    "status camp",
+]
+
+
+@pytest.mark.parametrize("words", LIGHT)
 def test_neither_torch_nor_numpy_is_imported(camp, words):
     process = run(words.split(), flags=["-X", "importtime"])
     _, error = process.communicate()

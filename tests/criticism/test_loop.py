@@ -195,20 +195,21 @@ BEYOND = Trials(ONES, MORE, sample_times=[0, 0.5, 1.5])
 NONE_FIT = Trials(ONES, LOST, role=["fit", "fit", "held out"])
 
 
-@pytest.mark.parametrize(
-    ("message", "changes"),
-    [
-        ("at least 3 repeats of one action", {"model": SimulatorModel(response)}),
-        ("noise would count twice", {"model": SimulatorModel(noisy, noise=NOISE)}),
-        ("at least two valid trials to fit; got 1", {"trials": measured(1, {}, num=1)}),
-        ("trials of the simulator's shape", {"trials": Trials(ONES, torch.ones(3, 4))}),
-        ("at least two valid trials to fit; got 0", {"trials": NONE_FIT}),
-        ("expected effects not named none", {"effects": [SCATTER]}),
-        ("actions of dimension 1", {"actions": DiscreteActions([[1.0, 2.0]])}),
-        ("rail, swing; got swing, rail", {"model": TWO, "trials": SWAPPED}),
-        ("those of the simulator, 0 to 1", {"model": TIMED, "trials": BEYOND}),
-    ],
-)
+#: What lacks, and what is said of it.
+INCOMPARABLE = [
+    ("at least 3 repeats of one action", {"model": SimulatorModel(response)}),
+    ("noise would count twice", {"model": SimulatorModel(noisy, noise=NOISE)}),
+    ("at least two valid trials to fit; got 1", {"trials": measured(1, {}, num=1)}),
+    ("trials of the simulator's shape", {"trials": Trials(ONES, torch.ones(3, 4))}),
+    ("at least two valid trials to fit; got 0", {"trials": NONE_FIT}),
+    ("expected effects not named none", {"effects": [SCATTER]}),
+    ("actions of dimension 1", {"actions": DiscreteActions([[1.0, 2.0]])}),
+    ("rail, swing; got swing, rail", {"model": TWO, "trials": SWAPPED}),
+    ("those of the simulator, 0 to 1", {"model": TIMED, "trials": BEYOND}),
+]
+
+
+@pytest.mark.parametrize(("message", "changes"), INCOMPARABLE)
 def test_what_cannot_be_compared(message, changes):
     given = {"model": MODEL, "trials": measured(1, {}), **changes}
     with pytest.raises(ValueError, match=message):

@@ -110,16 +110,17 @@ def gaussian(action, x, factor=1.0):
     return MultivariateNormal(mean.reshape(1), factor**2 / precision.reshape(1, 1))
 
 
-@pytest.mark.parametrize(
-    ("own", "every", "verdicts"),
-    [
-        (1.0, 1.0, ("trust",)),
-        (2.0, 1.0, ("refine",)),
-        (0.5, 1.0, ("stop", "refine")),
-        (2.0, 2.0, ("refine",)),
-        (0.5, 0.5, ("stop",)),
-    ],
-)
+#: Factors of the belief and of all beliefs, and verdicts.
+WIDTHS = [
+    (1.0, 1.0, ("trust",)),
+    (2.0, 1.0, ("refine",)),
+    (0.5, 1.0, ("stop", "refine")),
+    (2.0, 2.0, ("refine",)),
+    (0.5, 0.5, ("stop",)),
+]
+
+
+@pytest.mark.parametrize(("own", "every", "verdicts"), WIDTHS)
 def test_a_belief_too_wide_or_narrow_is_flagged(own, every, verdicts):
     action = torch.tensor([[1.0], [2.0]])
     x = torch.tensor([[0.4], [0.9]])

@@ -151,19 +151,20 @@ def product(*weights, shifts=()):
     return Combination(tuple(Term(i, w, log=True, shift=s) for i, w, s in terms))
 
 
-@pytest.mark.parametrize(
-    ("combination", "text"),
-    [
-        (product(2, -0.5), "a^2 / b^0.5"),
-        (product(-1, 1), "1 / a * b"),
-        (product(1, -1, shifts={0: -0.25}), "(a - 0.25) / b"),
-        (Combination((Term(0), Term(1, -0.8))), "a - 0.8 * b"),
-        (Combination((Term(0, -1.0), Term(1))), "-a + b"),
-        (Combination((Term(0, log=True), Term(1, -2.0))), "a * exp(-2 * b)"),
-        (Combination((Term(0), Term(1, log=True))), "b * exp(a)"),
-        (product(1, 1, 1, 1, 1), "a * b * c * d * ..."),
-    ],
-)
+#: Combinations, and how they read.
+FORMULAS = [
+    (product(2, -0.5), "a^2 / b^0.5"),
+    (product(-1, 1), "1 / a * b"),
+    (product(1, -1, shifts={0: -0.25}), "(a - 0.25) / b"),
+    (Combination((Term(0), Term(1, -0.8))), "a - 0.8 * b"),
+    (Combination((Term(0, -1.0), Term(1))), "-a + b"),
+    (Combination((Term(0, log=True), Term(1, -2.0))), "a * exp(-2 * b)"),
+    (Combination((Term(0), Term(1, log=True))), "b * exp(a)"),
+    (product(1, 1, 1, 1, 1), "a * b * c * d * ..."),
+]
+
+
+@pytest.mark.parametrize(("combination", "text"), FORMULAS)
 def test_formulas_read_as_they_compute(combination, text):
     assert combination.text(NAMES) == text
     if "..." in text:

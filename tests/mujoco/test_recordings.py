@@ -52,15 +52,16 @@ def test_logs_become_si_as_tables_do(tmp_path):
     assert converted.start["slide"].tolist() == pytest.approx([0.1, 0.1])
 
 
-@pytest.mark.parametrize(
-    ("names", "message"),
-    [
-        ({"position": "position [px]"}, r"'position' in m; got \[px\] in the rec"),
-        ({"position": "position [deg]"}, r"'position' in m; got \[deg\] in the rec"),
-        ({"time": "time [mm]"}, r"times in s, .* got mm"),
-        ({"start slide": "position [m]"}, "each quantity once; got position and"),
-    ],
-)
+#: Columns renamed, and what is said of them.
+NO_UNITS = [
+    ({"position": "position [px]"}, r"'position' in m; got \[px\] in the rec"),
+    ({"position": "position [deg]"}, r"'position' in m; got \[deg\] in the rec"),
+    ({"time": "time [mm]"}, r"times in s, .* got mm"),
+    ({"start slide": "position [m]"}, "each quantity once; got position and"),
+]
+
+
+@pytest.mark.parametrize(("names", "message"), NO_UNITS)
 def test_units_that_cannot_be_those_of_the_model_are_refused(names, message):
     with pytest.raises(ValueError, match=message):
         read([log.rename(columns=names) for log in logs()])
@@ -78,19 +79,17 @@ def test_a_log_has_a_column_each_for_a_sensor_and_an_input_of_one_name():
         from_mjcf(*arm, **given, recordings=[log])
 
 
-@pytest.mark.parametrize(
-    ("spoil", "message"),
-    [
-        (lambda log: log[:0], "samples in recording 1; got no rows"),
-        (lambda log: log.assign(push=6 * log["push"]), "its ctrlrange, -5 to 5"),
-        (lambda log: log.drop(columns="start slide"), "same columns .*start slide"),
-        (lambda log: log[::-1], "times that increase .* recording 1"),
-        (
-            lambda log: log.assign(time=1.7e9 + log["time"]),
-            "subtract the time at which",
-        ),
-    ],
-)
+#: What spoils a log, and what is said of it.
+NO_LOGS = [
+    (lambda log: log[:0], "samples in recording 1; got no rows"),
+    (lambda log: log.assign(push=6 * log["push"]), "its ctrlrange, -5 to 5"),
+    (lambda log: log.drop(columns="start slide"), "same columns .*start slide"),
+    (lambda log: log[::-1], "times that increase .* recording 1"),
+    (lambda log: log.assign(time=1.7e9 + log["time"]), "subtract the time at which"),
+]
+
+
+@pytest.mark.parametrize(("spoil", "message"), NO_LOGS)
 def test_logs_that_do_not_fit_are_said(spoil, message):
     one, other = logs()
     with pytest.raises(ValueError, match=message):

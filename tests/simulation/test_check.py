@@ -62,18 +62,19 @@ def test_a_clean_simulator_is_ready(simulator, seeds):
     assert any(fact.startswith(seeds) for fact in report.facts)
 
 
-@pytest.mark.parametrize(
-    ("simulator", "expected"),
-    [
-        (lambda t, a: t * a, "got identical x from two seeds"),
-        (lambda t, a: noisy(t, a)[:1], "one row a parameter set, shape (16, ...); got"),
-        (raises, "RuntimeError: no model file"),
-        (flat, "of one shape; got (2,) a row from 16 rows and (1,) from one"),
-        (lambda t, a: torch.full_like(t, torch.nan), "no row has a measurement"),
-        (mixed, "x depends on which rows are simulated together"),
-        (lambda t, a: a + torch.randn_like(a), "no parameter changes x"),
-    ],
-)
+#: Simulators, and their defect.
+DEFECTS = [
+    (lambda t, a: t * a, "got identical x from two seeds"),
+    (lambda t, a: noisy(t, a)[:1], "one row a parameter set, shape (16, ...); got"),
+    (raises, "RuntimeError: no model file"),
+    (flat, "of one shape; got (2,) a row from 16 rows and (1,) from one"),
+    (lambda t, a: torch.full_like(t, torch.nan), "no row has a measurement"),
+    (mixed, "x depends on which rows are simulated together"),
+    (lambda t, a: a + torch.randn_like(a), "no parameter changes x"),
+]
+
+
+@pytest.mark.parametrize(("simulator", "expected"), DEFECTS)
 def test_defects_are_found(simulator, expected):
     report = check(simulator)
     assert str(report).endswith("\nnot ready")

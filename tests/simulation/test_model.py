@@ -68,15 +68,16 @@ def test_effects_are_numbers_or_one_a_row(model):
         model(THETA, ACTION, SEEDS, friction=1.0)
 
 
-@pytest.mark.parametrize(
-    "model",
-    [
-        SimulatorModel(noisy),
-        SimulatorModel(noisy_row, batched=False),
-        SimulatorModel(noisy, noise=1.0),
-        SimulatorModel(line_row, batched=False, noise=1.0),
-    ],
-)
+#: Models that take seeds.
+SEEDED = [
+    SimulatorModel(noisy),
+    SimulatorModel(noisy_row, batched=False),
+    SimulatorModel(noisy, noise=1.0),
+    SimulatorModel(line_row, batched=False, noise=1.0),
+]
+
+
+@pytest.mark.parametrize("model", SEEDED)
 def test_rows_depend_on_their_seeds_alone(model):
     assert takes_seeds(model)
     x = model(THETA, ACTION, SEEDS)
@@ -140,16 +141,17 @@ def test_rows_that_raise_do_not_hide_whether_the_others_are_random(sd):
 NAN = torch.tensor([[1.0, torch.nan], [0, 0], [0, 0]])
 
 
-@pytest.mark.parametrize(
-    ("run", "text"),
-    [
-        (lambda m: m(THETA[:2], ACTION), r"as many rows; got \(2, 2\) and \(3, 1\)"),
-        (lambda m: m(THETA[0], ACTION), "expected theta"),
-        (lambda m: m(NAN, ACTION), r"finite theta; got \[1.0, nan\] in row 0"),
-        (lambda m: m(THETA, ACTION / 0), "expected finite action; got"),
-        (lambda m: m(THETA[:, :1], ACTION), "expected 2 parameters, a, b; got theta"),
-    ],
-)
+#: Calls of a model, and what is said of them.
+BAD_INPUT = [
+    (lambda m: m(THETA[:2], ACTION), r"as many rows; got \(2, 2\) and \(3, 1\)"),
+    (lambda m: m(THETA[0], ACTION), "expected theta"),
+    (lambda m: m(NAN, ACTION), r"finite theta; got \[1.0, nan\] in row 0"),
+    (lambda m: m(THETA, ACTION / 0), "expected finite action; got"),
+    (lambda m: m(THETA[:, :1], ACTION), "expected 2 parameters, a, b; got theta"),
+]
+
+
+@pytest.mark.parametrize(("run", "text"), BAD_INPUT)
 def test_bad_input(run, text):
     for batched, fn in ((True, line), (False, line_row)):
         model = SimulatorModel(fn, batched=batched, parameter_names=["a", "b"])
@@ -184,15 +186,16 @@ def x_of(function, **options):
     return simulate(lambda t, a, seeds: function(t), FOUR, FOUR, seed=0, **options).x
 
 
-@pytest.mark.parametrize(
-    "function",
-    [
-        lambda t: t.flip(0).numpy()[::-1],
-        lambda t: t.tolist(),
-        lambda t: t[:, 0],
-        lambda t: np.broadcast_to(t.numpy(), t.shape),
-    ],
-)
+#: Forms of x.
+FORMS = [
+    lambda t: t.flip(0).numpy()[::-1],
+    lambda t: t.tolist(),
+    lambda t: t[:, 0],
+    lambda t: np.broadcast_to(t.numpy(), t.shape),
+]
+
+
+@pytest.mark.parametrize("function", FORMS)
 def test_forms_of_x_that_are_taken(function, recwarn):
     assert torch.equal(x_of(function), FOUR)
     assert not recwarn.list

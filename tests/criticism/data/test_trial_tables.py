@@ -118,16 +118,17 @@ def test_a_table_in_another_encoding(encoding):
         Trials.from_csv("trials.csv")
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"columns": {"y": "x_y"}}, "columns of trial, time, .*; got y"),
-        ({"columns": {"x": "x_z"}}, "a column x_z for x; got .*'x_y'"),
-        ({"columns": {"time": ["time", "x_y"]}}, "one column for time; got time, x_y"),
-        ({"units": {"x_z": "m"}}, "got one of x_z"),
-        ({"order": "sorted"}, "expected order 'known' or 'unknown'; got"),
-    ],
-)
+#: Options, and what is said of them.
+UNFIT = [
+    ({"columns": {"y": "x_y"}}, "columns of trial, time, .*; got y"),
+    ({"columns": {"x": "x_z"}}, "a column x_z for x; got .*'x_y'"),
+    ({"columns": {"time": ["time", "x_y"]}}, "one column for time; got time, x_y"),
+    ({"units": {"x_z": "m"}}, "got one of x_z"),
+    ({"order": "sorted"}, "expected order 'known' or 'unknown'; got"),
+]
+
+
+@pytest.mark.parametrize(("options", "message"), UNFIT)
 def test_options_that_do_not_fit_the_table(options, message):
     with pytest.raises(ValueError, match=message):
         read(["1,0,1,5"], SHORT, **options)
@@ -223,15 +224,16 @@ def test_files_of_several_trials_name_their_file(header, columns, first, names):
     assert Trials.from_csv("runs", columns=columns).names == names
 
 
-@pytest.mark.parametrize(
-    ("rows", "header", "message"),
-    [
-        (["0,1,5"], "time_s,action_speed[m/s],x_height[m]", r"columns .*runs/b\.csv"),
-        (["0,1,5", "100,1,6"], HEADER, "same numbers in trials a and b of runs"),
-        (["0,1,5.5", "1,1,5 m"], HEADER, r"x_height\[m\], row 2 .*runs/b.csv"),
-        ([], HEADER, r"no rows in runs/b\.csv"),
-    ],
-)
+#: Rows and header of a second file, and what is said of it.
+APART = [
+    (["0,1,5"], "time_s,action_speed[m/s],x_height[m]", r"columns .*runs/b\.csv"),
+    (["0,1,5", "100,1,6"], HEADER, "same numbers in trials a and b of runs"),
+    (["0,1,5.5", "1,1,5 m"], HEADER, r"x_height\[m\], row 2 .*runs/b.csv"),
+    ([], HEADER, r"no rows in runs/b\.csv"),
+]
+
+
+@pytest.mark.parametrize(("rows", "header", "message"), APART)
 def test_recordings_that_do_not_go_together(rows, header, message, tmp_path):
     with pytest.raises(ValueError, match="expected recordings in .*; got no"):
         Trials.from_csv(tmp_path)

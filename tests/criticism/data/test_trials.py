@@ -29,24 +29,25 @@ NAN = float("nan")
 ROLE = ["fit", "held out"]
 
 
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        *(
-            ({"names": names}, "expected names of 2 trials, each another")
-            for names in ("ab", ["a"], ["a", "a"], ["a", " "])
-        ),
-        ({"x": [1.0]}, "expected actions .* with as many rows"),
-        ({"x": [NAN, NAN]}, "expected at least one valid trial"),
-        ({"x": [1.0, NAN], "role": ROLE}, "in the held-out trials; got NaN in trial 1"),
-        ({"sample_times": [1.0]}, r"expected sample_times of shape \(2,\)"),
-        ({"x": np.ones((2, 1)) + 1j}, "x of real numbers; got torch.complex128"),
-        ({"index": [0.0, NAN]}, "expected finite places in index"),
-        ({"repeat_of": [-1, 7]}, "expected repeat_of among the positions 0 to 1"),
-        ({"repeat_of": [1, 0]}, "runs in a circle"),
-        ({"mask": [[255, 1], [1, 0]]}, "expected a mask of True and False.*got 255"),
-    ],
-)
+#: What is wrong of two trials, and what is said of it.
+BAD_TRIALS = [
+    *(
+        ({"names": names}, "expected names of 2 trials, each another")
+        for names in ("ab", ["a"], ["a", "a"], ["a", " "])
+    ),
+    ({"x": [1.0]}, "expected actions .* with as many rows"),
+    ({"x": [NAN, NAN]}, "expected at least one valid trial"),
+    ({"x": [1.0, NAN], "role": ROLE}, "in the held-out trials; got NaN in trial 1"),
+    ({"sample_times": [1.0]}, r"expected sample_times of shape \(2,\)"),
+    ({"x": np.ones((2, 1)) + 1j}, "x of real numbers; got torch.complex128"),
+    ({"index": [0.0, NAN]}, "expected finite places in index"),
+    ({"repeat_of": [-1, 7]}, "expected repeat_of among the positions 0 to 1"),
+    ({"repeat_of": [1, 0]}, "runs in a circle"),
+    ({"mask": [[255, 1], [1, 0]]}, "expected a mask of True and False.*got 255"),
+]
+
+
+@pytest.mark.parametrize(("changes", "message"), BAD_TRIALS)
 def test_bad_trials(changes, message):
     with pytest.raises(ValueError, match=message):
         Trials(**{"action": SPEED, "x": STOP} | changes)
@@ -101,20 +102,21 @@ UNITS = {"time": "ms", "action_v": "deg/s", "x_y": "mm", "input_u": "mNm"}
 ROWS = [(0, 180, 5, 1), (20, 180, -2, 3)]
 
 
-@pytest.mark.parametrize(
-    ("unit", "factor", "si"),
-    [
-        ("mm/s^2", 1e-3, "m/s^2"),
-        ("m/s²", 1, "m/s²"),
-        ("1/mm", 1e3, "1/m"),
-        ("°", np.pi / 180, "rad"),
-        ("rpm", np.pi / 30, "rad/s"),
-        ("mNm", 1e-3, "N m"),
-        ("N m s/rad", 1, "N m s/rad"),
-        ("mm s-1", 1e-3, "m s-1"),
-        ("min", 60, "s"),
-    ],
-)
+#: Units, their factor, and the unit in SI.
+IN_SI = [
+    ("mm/s^2", 1e-3, "m/s^2"),
+    ("m/s²", 1, "m/s²"),
+    ("1/mm", 1e3, "1/m"),
+    ("°", np.pi / 180, "rad"),
+    ("rpm", np.pi / 30, "rad/s"),
+    ("mNm", 1e-3, "N m"),
+    ("N m s/rad", 1, "N m s/rad"),
+    ("mm s-1", 1e-3, "m s-1"),
+    ("min", 60, "s"),
+]
+
+
+@pytest.mark.parametrize(("unit", "factor", "si"), IN_SI)
 def test_units_become_si(unit, factor, si):
     assert to_si(unit) == (pytest.approx(factor), si)
 
@@ -208,18 +210,19 @@ LACKING, BACK = torch.zeros(2, 11), FINE.clone()
 LACKING[1, 4], BACK[3] = torch.nan, 0.1
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ({"inputs": LACKING}, "NaN for input 'input' of trial 1, value 4; fill it in"),
-        ({"inputs": torch.zeros(2, 11), "input_times": BACK}, "got 0.1 after 0.2 for"),
-        ({"inputs": None}, "expected actions, or inputs"),
-        (
-            {"inputs": torch.zeros(2, 11), "input_times": FINE / 1000},
-            "x of trial 0 measured within the time of its input 'input', 0 to 0.001",
-        ),
-    ],
-)
+#: What is wrong of inputs, and what is said of it.
+BAD_INPUTS = [
+    ({"inputs": LACKING}, "NaN for input 'input' of trial 1, value 4; fill it in"),
+    ({"inputs": torch.zeros(2, 11), "input_times": BACK}, "got 0.1 after 0.2 for"),
+    ({"inputs": None}, "expected actions, or inputs"),
+    (
+        {"inputs": torch.zeros(2, 11), "input_times": FINE / 1000},
+        "x of trial 0 measured within the time of its input 'input', 0 to 0.001",
+    ),
+]
+
+
+@pytest.mark.parametrize(("arguments", "message"), BAD_INPUTS)
 def test_bad_inputs(arguments, message):
     keywords = {"action": None, "input_times": FINE, "sample_times": TIMES, **arguments}
     with pytest.raises(ValueError, match=message):

@@ -174,16 +174,17 @@ THREE |= {"ab": (20, 10.0), "ac": (10, 50.0), "bc": (10, 50.0)}
 TWO = {"-": (0.0, 101.0), "a": (20.0, 10.0), "b": (5.0, 60.0)}
 
 
-@pytest.mark.parametrize(
-    ("errors", "timed", "first"),
-    [
-        (THREE | {"abc": (24.0, 9.5)}, True, "ab"),
-        (THREE | {"abc": (25.0, 9.5)}, True, "abc"),  # decisive
-        (TWO | {"ab": (21.5, 9.5)}, False, "a"),
-        (TWO | {"ab": (21.7, 9.5)}, False, "ab"),  # five times without times
-        (TWO | {"ab": (21.5, 9.5)}, True, "ab"),
-    ],
-)
+#: Errors, whether trials have times, and what is begun with.
+FURTHER = [
+    (THREE | {"abc": (24.0, 9.5)}, True, "ab"),
+    (THREE | {"abc": (25.0, 9.5)}, True, "abc"),  # decisive
+    (TWO | {"ab": (21.5, 9.5)}, False, "a"),
+    (TWO | {"ab": (21.7, 9.5)}, False, "ab"),  # five times without times
+    (TWO | {"ab": (21.5, 9.5)}, True, "ab"),
+]
+
+
+@pytest.mark.parametrize(("errors", "timed", "first"), FURTHER)
 def test_a_further_effect_needs_evidence(errors, timed, first):
     assert compared(errors, timed).starts()[0] == ModelKey((*first,))
 

@@ -38,16 +38,17 @@ from tests.effects import autocorrelated, effect, half, normal, on_outcomes
 CHANNELS = np.array([0.2, 30.0]), np.array([0.1, 33.0])
 
 
-@pytest.mark.parametrize(
-    ("left_out", "held_out", "sensor", "where"),
-    [
-        ((1.45, 1.47), (None, None), [0.005], "left-out trials"),
-        ((1.45, 1.47), (0.31, 0.3), [0.005], "left-out trials"),
-        ((1.45, 1.2), (0.31, 5.2), [0.005], "held-out trials"),
-        (CHANNELS, (None, None), [0.1, 1.0], "left-out trials in sensor deviations"),
-        (CHANNELS, (None, None), [0.001, 10.0], ""),
-    ],
-)
+#: Errors left out and held out, the sensor, and where one rises.
+RAISED = [
+    ((1.45, 1.47), (None, None), [0.005], "left-out trials"),
+    ((1.45, 1.47), (0.31, 0.3), [0.005], "left-out trials"),
+    ((1.45, 1.2), (0.31, 5.2), [0.005], "held-out trials"),
+    (CHANNELS, (None, None), [0.1, 1.0], "left-out trials in sensor deviations"),
+    (CHANNELS, (None, None), [0.001, 10.0], ""),
+]
+
+
+@pytest.mark.parametrize(("left_out", "held_out", "sensor", "where"), RAISED)
 def test_what_raises_an_error_that_is_printed_does_not_help(
     left_out, held_out, sensor, where
 ):
@@ -314,18 +315,19 @@ def respond(theta, action, *, delay=0.0, lag=0.0, clock=0.0, unused=0.0):
     return (size * torch.sin(phase)).to(theta.dtype)
 
 
-@pytest.mark.parametrize(
-    ("names", "pair"),
-    [
-        # Both have the derivative of x, and a lag is smaller at high frequencies.
-        (("delay", "lag"), None),
-        (("lag", "two"), None),
-        # 1 - exp(-t) takes the place of a delay t.
-        (("delay", "clock"), ("delay", "clock")),
-        (("lag", "delay", "clock"), ("delay", "clock")),
-        (("two", "clock"), ("two", "clock")),
-    ],
-)
+#: Effects, and those of them that are alike.
+PAIRS = [
+    # Both have the derivative of x, and a lag is smaller at high frequencies.
+    (("delay", "lag"), None),
+    (("lag", "two"), None),
+    # 1 - exp(-t) takes the place of a delay t.
+    (("delay", "clock"), ("delay", "clock")),
+    (("lag", "delay", "clock"), ("delay", "clock")),
+    (("two", "clock"), ("two", "clock")),
+]
+
+
+@pytest.mark.parametrize(("names", "pair"), PAIRS)
 def test_effects_that_are_alike_near_zero_alone_are_told_apart(names, pair):
     model = SimulatorModel(respond, noise=0.02, sample_times=STAMPS)
     gen, action = torch.Generator().manual_seed(0), FREQUENCIES.values

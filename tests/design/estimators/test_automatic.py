@@ -33,15 +33,16 @@ def unusable(actions=NEAR):
     return candidates(actions, 512, noise=heavy, pairs=True)
 
 
-@pytest.mark.parametrize(
-    ("model", "estimator"),
-    [
-        (ExactLikelihoodAndPosterior(), PosteriorGain),
-        (ExactLikelihood(), LikelihoodGain),
-        (ExactRatio(), InfoNCEGain),
-        (None, "EntropyGain"),
-    ],
-)
+#: Models, and the estimator by what they can say.
+SAYING = [
+    (ExactLikelihoodAndPosterior(), PosteriorGain),
+    (ExactLikelihood(), LikelihoodGain),
+    (ExactRatio(), InfoNCEGain),
+    (None, "EntropyGain"),
+]
+
+
+@pytest.mark.parametrize(("model", "estimator"), SAYING)
 def test_what_the_model_can_say_is_used_where_the_noise_cannot(model, estimator):
     chosen, notes = choose_estimator(model, unusable(), PRIOR)
     assert "noise is not Gaussian" in notes[0]

@@ -143,18 +143,16 @@ def independent(prior: dist.Distribution) -> dist.Independent:
     return dist.Independent(prior, 1)
 
 
-@pytest.mark.parametrize(
-    ("prior", "message"),
-    [
-        (
-            independent(dist.Poisson(3 * TWO)),
-            "continuous parameters; got a discrete one",
-        ),
-        (independent(dist.Bernoulli(0.5 * TWO)), "declare the choice as an Effect"),
-        (dist.Dirichlet(TWO), "may vary one by one; got Dirichlet"),
-        (dist.Normal(0.0, 1.0), r"event shape \(theta_dim,\); got Normal"),
-    ],
-)
+#: Priors that none can begin from, and what is said of them.
+NO_PRIORS = [
+    (independent(dist.Poisson(3 * TWO)), "continuous parameters; got a discrete one"),
+    (independent(dist.Bernoulli(0.5 * TWO)), "declare the choice as an Effect"),
+    (dist.Dirichlet(TWO), "may vary one by one; got Dirichlet"),
+    (dist.Normal(0.0, 1.0), r"event shape \(theta_dim,\); got Normal"),
+]
+
+
+@pytest.mark.parametrize(("prior", "message"), NO_PRIORS)
 def test_what_is_discrete_or_tied_is_refused(prior, message):
     with pytest.raises(ValueError, match=message):
         require_support(prior)

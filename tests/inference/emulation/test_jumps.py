@@ -100,15 +100,16 @@ def noisy(draw):
     return lambda theta, xi: theta * xi + 0.3 * draw(theta)
 
 
-@pytest.mark.parametrize(
-    ("draw", "holds"),
-    [
-        (torch.randn_like, True),
-        (lambda t: -torch.rand_like(t).log(), False),  # exponential
-        (lambda t: torch.randn_like(t).sign(), False),
-        (lambda t: torch.exp(1.5 * t) * torch.randn_like(t), False),
-    ],
-)
+#: Draws of noise, and whether it is normal.
+NOISES = [
+    (torch.randn_like, True),
+    (lambda t: -torch.rand_like(t).log(), False),  # exponential
+    (lambda t: torch.randn_like(t).sign(), False),
+    (lambda t: torch.exp(1.5 * t) * torch.randn_like(t), False),
+]
+
+
+@pytest.mark.parametrize(("draw", "holds"), NOISES)
 def test_few_simulations_tell_noise_that_is_not_normal(draw, holds):
     options = CampaignOptions(max_simulations=500, planned_trials=3, refinement=FEW)
     actions = DiscreteActions([1.0, 2.0])

@@ -169,15 +169,16 @@ def peaks(centers: np.ndarray, sd: np.ndarray) -> Any:
     return log_density
 
 
-@pytest.mark.parametrize(
-    ("centers", "sd"),
-    [
-        ([[0.2, -0.3]], [1e-4, 1e-4]),
-        ([[0.3, 0.0]], [1e-4, 0.2]),
-        ([[-0.7, 0.2], [0.7, -0.2]], [1e-3, 1e-2]),
-        ([[-0.8, 0.2], [-0.3, 0.2], [0.2, 0.2], [0.7, 0.2]], [0.01, 0.1]),
-    ],
-)
+#: Centers and deviations.
+PEAKS = [
+    ([[0.2, -0.3]], [1e-4, 1e-4]),
+    ([[0.3, 0.0]], [1e-4, 0.2]),
+    ([[-0.7, 0.2], [0.7, -0.2]], [1e-3, 1e-2]),
+    ([[-0.8, 0.2], [-0.3, 0.2], [0.2, 0.2], [0.7, 0.2]], [0.01, 0.1]),
+]
+
+
+@pytest.mark.parametrize(("centers", "sd"), PEAKS)
 def test_finds_narrow_peaks(centers: list, sd: list):
     rng = np.random.default_rng(0)
     place, width = np.array(centers), np.array(sd)

@@ -284,15 +284,16 @@ class _Network:
         return self.normal.log_prob(theta)
 
 
-@pytest.mark.parametrize(
-    ("network", "kind"),
-    [
-        (_Network(6.0), "under-confident"),
-        (_Network(0.2), "overconfident"),
-        (_Network(1.0, shift=1.0), "misplaced"),
-        (_Network(1.1), None),
-    ],
-)
+#: Networks, and what they are.
+NETWORKS = [
+    (_Network(6.0), "under-confident"),
+    (_Network(0.2), "overconfident"),
+    (_Network(1.0, shift=1.0), "misplaced"),
+    (_Network(1.1), None),
+]
+
+
+@pytest.mark.parametrize(("network", "kind"), NETWORKS)
 def test_a_blunt_and_an_overconfident_network_are_told_apart(network, kind):
     """Blunt by a factor 6 in two dimensions: 2 log 6 = 3.6 nats of entropy."""
     belief = ASBI(PRIOR).update_all(TRIALS, simulator, refinement=REFINEMENT, seed=0)

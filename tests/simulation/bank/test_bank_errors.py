@@ -76,18 +76,19 @@ def made(scale, power=2):
     return scaled
 
 
-@pytest.mark.parametrize(
-    ("make", "one", "other"),
-    [
-        (Rail, np.float32(1.0), np.float32(2.0)),
-        (Rail, {"ice"}, {"ice", "steel"}),
-        (Rail, 1j, 2j),
-        (Rail, b"a", b"b"),
-        (Rail, torch.ones(2).bfloat16(), torch.zeros(2).bfloat16()),
-        (made, 2.0, 3.0),
-        (partial(made, 2.0), 2, 3),
-    ],
-)
+#: What makes a simulator, and two settings of it.
+SETTINGS = [
+    (Rail, np.float32(1.0), np.float32(2.0)),
+    (Rail, {"ice"}, {"ice", "steel"}),
+    (Rail, 1j, 2j),
+    (Rail, b"a", b"b"),
+    (Rail, torch.ones(2).bfloat16(), torch.zeros(2).bfloat16()),
+    (made, 2.0, 3.0),
+    (partial(made, 2.0), 2, 3),
+]
+
+
+@pytest.mark.parametrize(("make", "one", "other"), SETTINGS)
 def test_settings_and_captured_variables_of_any_kind_are_seen(make, one, other):
     before = fingerprint(make(one))
     require_same("it", before, fingerprint(make(one)))

@@ -59,20 +59,21 @@ def test_former_options_of_a_campaign_are_taken_for_one_version():
     assert loaded == options
 
 
-@pytest.mark.parametrize(
-    ("options", "name"),
-    [
-        (Workers(2, 9.0), "num_worker"),
-        (StopRules(max_sd=[1, 2]), "max_sds"),
-        (CampaignDetails(look_ahead=1), "num_score"),
-        (RefinementOptions(num_histories=500), "num_history"),
-        (RatioClassifier(hidden_features=(8,)), "hidden_feature"),
-        (LFIRE(num_marginal=50), "num_marginals"),
-        (CampaignOptions(workers=3), "num_sample"),
-        (MixtureDensity.faithful(), "num_iteration"),
-        (MixtureDetails(batch_size=7), "batch_sizes"),
-    ],
-)
+#: Options, and a name that is mistyped.
+VALUES = [
+    (Workers(2, 9.0), "num_worker"),
+    (StopRules(max_sd=[1, 2]), "max_sds"),
+    (CampaignDetails(look_ahead=1), "num_score"),
+    (RefinementOptions(num_histories=500), "num_history"),
+    (RatioClassifier(hidden_features=(8,)), "hidden_feature"),
+    (LFIRE(num_marginal=50), "num_marginals"),
+    (CampaignOptions(workers=3), "num_sample"),
+    (MixtureDensity.faithful(), "num_iteration"),
+    (MixtureDetails(batch_size=7), "batch_sizes"),
+]
+
+
+@pytest.mark.parametrize(("options", "name"), VALUES)
 def test_options_are_values(options, name):
     kind = type(options)
     same = [
