@@ -147,14 +147,15 @@ def test_a_state_that_diverges_is_invalid_and_counted():
     assert (few[0] == x[0]).all()
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"parameters": {"hinge.dampin": (0, 1)}}, "did you mean 'hinge.damping'"),
-        ({"parameters": {"bob.mass": (-1, 1)}}, "'bob.mass' from 0 on; got -1 to 1"),
-        ({"times": [1.7e9, 1.7e9 + 1]}, "subtract the time at which the trial starts"),
-    ],
-)
+#: What does not fit, and what is said of it.
+UNFIT = [
+    ({"parameters": {"hinge.dampin": (0, 1)}}, "did you mean 'hinge.damping'"),
+    ({"parameters": {"bob.mass": (-1, 1)}}, "'bob.mass' from 0 on; got -1 to 1"),
+    ({"times": [1.7e9, 1.7e9 + 1]}, "subtract the time at which the trial starts"),
+]
+
+
+@pytest.mark.parametrize(("change", "message"), UNFIT)
 def test_what_does_not_fit_is_said(change, message):
     with pytest.raises(ValueError, match=message):
         pendulum(**change)

@@ -81,28 +81,30 @@ def test_defects_are_found(simulator, expected):
     assert any(expected in defect for defect in report.defects)
 
 
-@pytest.mark.parametrize(
-    ("simulator", "expected"),
-    [
-        (lambda t, a: noisy(t, a)[:, :1], "changing theta_2 leaves x as it is"),
-        (SimulatorModel(noisy, noise=1.0), "fn is random beside declared noise, which"),
-        (SimulatorModel(some_raise, batched=False), "unstable contact; their outcome"),
-    ],
-)
+#: Simulators, and what is said of them.
+WARNED = [
+    (lambda t, a: noisy(t, a)[:, :1], "changing theta_2 leaves x as it is"),
+    (SimulatorModel(noisy, noise=1.0), "fn is random beside declared noise, which"),
+    (SimulatorModel(some_raise, batched=False), "unstable contact; their outcome"),
+]
+
+
+@pytest.mark.parametrize(("simulator", "expected"), WARNED)
 def test_warnings_do_not_fail(simulator, expected):
     report = check(simulator)
     assert report.is_ready
     assert any(expected in warning for warning in report.warnings)
 
 
-@pytest.mark.parametrize(
-    ("name", "noise", "status", "text"),
-    [
-        ("robot_a", "torch.randn_like(theta)", 0, "\nready\n"),
-        ("robot_b", "0", 1, "defect: "),
-        ("json", "0", 2, "expected a file whose name no other module has"),
-    ],
-)
+#: Names of files, their noise, exit status, and what is said.
+COMMANDS = [
+    ("robot_a", "torch.randn_like(theta)", 0, "\nready\n"),
+    ("robot_b", "0", 1, "defect: "),
+    ("json", "0", 2, "expected a file whose name no other module has"),
+]
+
+
+@pytest.mark.parametrize(("name", "noise", "status", "text"), COMMANDS)
 def test_the_command(tmp_path, capsys, monkeypatch, name, noise, status, text):
     monkeypatch.setattr(sys, "path", [*sys.path])
     lines = "import torch\n", "def fn(theta, action):\n", f"    return theta + {noise}"

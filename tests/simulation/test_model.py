@@ -163,14 +163,15 @@ def ragged(theta, action, rng):
     return np.zeros(1 + int(theta[0]))
 
 
-@pytest.mark.parametrize(
-    ("fn", "options", "text"),
-    [
-        (lambda t, a: 3.0, {}, r"expected x with one row a parameter set"),
-        (line, {"channel_names": ["x", "y"]}, "expected 2 channels, x, y; got x of"),
-        (ragged, {"batched": False}, r"of one shape, \(2,\); got \(4,\) in row 1"),
-    ],
-)
+#: Functions, options, and what is said of their output.
+BAD_OUTPUT = [
+    (lambda t, a: 3.0, {}, r"expected x with one row a parameter set"),
+    (line, {"channel_names": ["x", "y"]}, "expected 2 channels, x, y; got x of"),
+    (ragged, {"batched": False}, r"of one shape, \(2,\); got \(4,\) in row 1"),
+]
+
+
+@pytest.mark.parametrize(("fn", "options", "text"), BAD_OUTPUT)
 def test_bad_output(fn, options, text):
     with pytest.raises(ValueError, match=text):
         SimulatorModel(fn, **options)(THETA, ACTION)
@@ -218,14 +219,15 @@ COMPLEX = [lambda t: t + 1j, lambda t: t.numpy() + 1j, lambda t: [1j] * len(t)]
 EMPTY = [lambda t: torch.zeros(len(t), 3, 0), lambda t: [[]] * len(t)]
 
 
-@pytest.mark.parametrize(
-    ("functions", "text"),
-    [
-        (BEYOND, r"expected x within \+-3.4e38"),
-        (COMPLEX, "expected x of real numbers; got .*complex"),
-        (EMPTY, "expected at least one number a row of x"),
-    ],
-)
+#: Functions, and what is said of them.
+LOST = [
+    (BEYOND, r"expected x within \+-3.4e38"),
+    (COMPLEX, "expected x of real numbers; got .*complex"),
+    (EMPTY, "expected at least one number a row of x"),
+]
+
+
+@pytest.mark.parametrize(("functions", "text"), LOST)
 def test_numbers_that_would_be_lost_are_refused(functions, text):
     for function in functions:
         with pytest.raises(ValueError, match=text):

@@ -23,14 +23,15 @@ def counted(theta, action):
     return campaigns.drawn(theta, action)
 
 
-@pytest.mark.parametrize(
-    ("simulator", "given"),
-    [
-        (campaigns.MODEL, {"method": "asbi"}),
-        (campaigns.drawn, {"method": "nlhi"}),
-        (campaigns.MODEL, {"options": {"max_simulations": 100, "planned_trials": 2}}),
-    ],
-)
+#: Simulators, and what else is given.
+LEFT = [
+    (campaigns.MODEL, {"method": "asbi"}),
+    (campaigns.drawn, {"method": "nlhi"}),
+    (campaigns.MODEL, {"options": {"max_simulations": 100, "planned_trials": 2}}),
+]
+
+
+@pytest.mark.parametrize(("simulator", "given"), LEFT)
 def test_left_after_every_step(tmp_path, simulator, given):
     given = {"simulator": simulator, "actions": [0.5, 1.0, 2.0], **given}
     whole = campaigns.go_on(campaigns.new(**given), 2)

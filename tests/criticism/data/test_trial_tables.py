@@ -210,14 +210,15 @@ def test_a_file_a_trial():
 BALLS = {"trial": "ball", "time": "t", "x": "h", "action": "u"}
 
 
-@pytest.mark.parametrize(
-    ("header", "columns", "first", "names"),
-    [
-        ("action_v,x_y", None, ["1,2", "2,3"], ("0", "1", "2")),
-        (f"trial,{HEADER}", None, ["1,0,1,5", "2,0,2,5"], ("a 1", "a 2", "b 1")),
-        ("ball,t,u,h", BALLS, ["1,0,1,6", "2,0,1,7"], ("a 1", "a 2", "b 1")),
-    ],
-)
+#: Headers, columns, first rows, and names.
+SEVERAL = [
+    ("action_v,x_y", None, ["1,2", "2,3"], ("0", "1", "2")),
+    (f"trial,{HEADER}", None, ["1,0,1,5", "2,0,2,5"], ("a 1", "a 2", "b 1")),
+    ("ball,t,u,h", BALLS, ["1,0,1,6", "2,0,1,7"], ("a 1", "a 2", "b 1")),
+]
+
+
+@pytest.mark.parametrize(("header", "columns", "first", "names"), SEVERAL)
 def test_files_of_several_trials_name_their_file(header, columns, first, names):
     write_run("a.csv", *first, header=header)
     write_run("b.csv", first[0] + ".5", header=header)

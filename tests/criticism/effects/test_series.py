@@ -213,14 +213,15 @@ def trials_of(friction):
     )
 
 
-@pytest.mark.parametrize(
-    ("friction", "verdict"),
-    [
-        (0.5 + 0.1 * (SPEED - 1.875), "friction by speed"),
-        (0.5 + 0.02 * (torch.arange(8) - 3.5), "friction by trial"),
-        (torch.full((8,), 0.5), "none"),
-    ],
-)
+#: Frictions, and the verdict.
+DEPENDING = [
+    (0.5 + 0.1 * (SPEED - 1.875), "friction by speed"),
+    (0.5 + 0.02 * (torch.arange(8) - 3.5), "friction by trial"),
+    (torch.full((8,), 0.5), "none"),
+]
+
+
+@pytest.mark.parametrize(("friction", "verdict"), DEPENDING)
 def test_what_a_parameter_depends_on_is_named(friction, verdict):
     trials = trials_of(friction)
     effects = varying_parameters(STOPPING, FRICTION, trials)

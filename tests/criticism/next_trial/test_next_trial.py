@@ -94,14 +94,15 @@ def test_where_no_action_separates_none_is_named():
 # Actions beyond the permitted ones
 
 
-@pytest.mark.parametrize(
-    ("values", "farthest", "sign"),
-    [
-        ([0.5, 1.0, 3.0], 4.25, 1),  # a speed has no other sign
-        ([-0.5, -1.0, -3.0], 4.25, -1),
-        ([-1.0, 0.0, 1.0], 2.0, 0),
-    ],
-)
+#: Actions, the farthest beyond them, and their sign.
+EXTRAPOLATED = [
+    ([0.5, 1.0, 3.0], 4.25, 1),  # a speed has no other sign
+    ([-0.5, -1.0, -3.0], 4.25, -1),
+    ([-1.0, 0.0, 1.0], 2.0, 0),
+]
+
+
+@pytest.mark.parametrize(("values", "farthest", "sign"), EXTRAPOLATED)
 def test_extrapolated_actions_keep_their_sign(values, farthest, sign):
     actions = DiscreteActions(values)
     found = beyond_range(actions, actions.values, limit=16)[:, 0]

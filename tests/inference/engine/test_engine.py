@@ -103,14 +103,15 @@ def spread():
     return np.sqrt(np.average((gain - mean) ** 2, weights=weight))
 
 
-@pytest.mark.parametrize(
-    ("sd", "seed", "settings", "most"),
-    [
-        (1e-3, 1, FEW, 12_000),
-        (1e-4, 0, Settings(), 30_000),
-        (1e-4, 1, Settings(), 30_000),
-    ],
-)
+#: Widths, seeds, settings, and simulations at most.
+RIDGES = [
+    (1e-3, 1, FEW, 12_000),
+    (1e-4, 0, Settings(), 30_000),
+    (1e-4, 1, Settings(), 30_000),
+]
+
+
+@pytest.mark.parametrize(("sd", "seed", "settings", "most"), RIDGES)
 def test_a_ridge_is_followed_however_thin(sd, seed, settings, most):
     """At 1e-4 of the prior few normals along it left gaps, and particles half a nat."""
     own, rng = product(sd), np.random.default_rng(seed)
