@@ -77,13 +77,6 @@ class ExactModel:
         scale = 0.5 * variance.log() + math.log(self.spread)
         return (-0.5 * z**2 - scale - 0.5 * math.log(2 * math.pi)).sum(-1)
 
-    def sample_batched(
-        self, sample_shape: torch.Size, x: Tensor, action: Tensor, **options: object
-    ) -> Tensor:
-        mean, variance = moments(x, action)
-        sd = self.spread * variance.sqrt()
-        return mean + sd * torch.randn(*sample_shape, *mean.shape)
-
 
 class ExactLikelihood:
     """The likelihood as a model for the designer.
@@ -102,25 +95,8 @@ class ExactLikelihood:
         return log_normal(x - action * theta, self.spread)
 
 
-class ExactLikelihoodAndPosterior(ExactLikelihood):
-    """Both.
-
-    Args:
-        spread: Of the likelihood's noise, 1 is exact.
-        proposal: Of the posterior, 1 is exact.
-    """
-
-    def __init__(self, spread: float = 1.0, proposal: float = 1.0) -> None:
-        super().__init__(spread)
-        self._posterior = ExactModel(proposal)
-
-    def log_posterior(self, theta: Tensor, x: Tensor, action: Tensor) -> Tensor:
-        return self._posterior.log_posterior(theta, x, action)
-
-    def sample_batched(
-        self, sample_shape: torch.Size, x: Tensor, action: Tensor, **options: object
-    ) -> Tensor:
-        return self._posterior.sample_batched(sample_shape, x, action)
+class ExactLikelihoodAndPosterior(ExactLikelihood, ExactModel):
+    """Both."""
 
 
 class ExactRatio:
