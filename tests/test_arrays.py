@@ -5,17 +5,15 @@ import pytest
 import torch
 from sbi.utils import BoxUniform
 
-from sbi_active import (
-    Campaign,
-    DiscreteActions,
-    InformationGainDesigner,
-    SimulatorModel,
-)
+from sbi_active.actions import DiscreteActions
 from sbi_active.arrays import distance_from, measured, own_tensor
+from sbi_active.campaign import Campaign
 from sbi_active.criticism import Trials
 from sbi_active.criticism.data.tables import read_trials
 from sbi_active.criticism.misfit.rule import Rule
+from sbi_active.design import InformationGainDesigner
 from sbi_active.mujoco import from_mjcf
+from sbi_active.simulation import SimulatorModel
 
 MASKED = np.ma.masked_array([1.0, 2.0], mask=[False, True])
 

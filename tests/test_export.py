@@ -8,16 +8,11 @@ import torch
 import xarray as xr
 from sbi.utils import BoxUniform
 
-from sbi_active import (
-    BoxActions,
-    Campaign,
-    DiscreteActions,
-    GaussianNoise,
-    SimulatorModel,
-    to_datatree,
-    to_inference_data,
-)
+from sbi_active import to_datatree, to_inference_data
+from sbi_active.actions import BoxActions, DiscreteActions
+from sbi_active.campaign import Campaign
 from sbi_active.criticism import Trials, close_loop, generic_effects
+from sbi_active.simulation import GaussianNoise, SimulatorModel
 from tests.campaign.problem import OPTIONS
 
 matplotlib.use("Agg")

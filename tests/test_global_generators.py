@@ -6,23 +6,19 @@ import torch
 from attrs import evolve
 from scipy import stats
 
-from sbi_active import (
-    ALHI,
-    ASBI,
-    GaussianNoise,
-    InformationGainDesigner,
-    RandomDesigner,
-    SeqBED,
-    SimulatorModel,
-    seeding,
-    simulate,
-    to_inference_data,
-)
+from sbi_active import seeding, to_inference_data
 from sbi_active.actions import BoxActions, MixedActions
 from sbi_active.criticism import Trials, close_loop
-from sbi_active.inference import refine
+from sbi_active.design import InformationGainDesigner, RandomDesigner
+from sbi_active.inference import ALHI, ASBI, SeqBED, refine
 from sbi_active.inference.rounds.rows import Observation
-from sbi_active.simulation import check_simulator, estimate_noise
+from sbi_active.simulation import (
+    GaussianNoise,
+    SimulatorModel,
+    check_simulator,
+    estimate_noise,
+    simulate,
+)
 from tests.campaign.problem import (
     ACTIONS,
     MODEL,

@@ -4,16 +4,12 @@ import torch
 from attrs import evolve
 from sbi.utils import BoxUniform
 
-from sbi_active import (
-    Campaign,
-    CampaignOptions,
-    DiscreteActions,
-    MixtureDensity,
-    RefinementOptions,
-    SimulatorModel,
-)
+from sbi_active.actions import DiscreteActions
+from sbi_active.campaign import Campaign, CampaignOptions
 from sbi_active.campaign.options import CampaignDetails
+from sbi_active.inference import MixtureDensity, RefinementOptions
 from sbi_active.inference.networks.ratio_network import RatioClassifier
+from sbi_active.simulation import SimulatorModel
 
 PRIOR = BoxUniform(torch.zeros(1), torch.ones(1))
 ACTIONS = DiscreteActions([0.5, 1.0, 3.0])

@@ -10,17 +10,12 @@ from attrs import evolve
 from sbi.utils import BoxUniform
 from torch.distributions import MultivariateNormal
 
-from sbi_active import (
-    Campaign,
-    CampaignOptions,
-    DiscreteActions,
-    SimulatorModel,
-    StopRules,
-)
-from sbi_active.actions import SignalActions
+from sbi_active.actions import DiscreteActions, SignalActions
 from sbi_active.actions.waveforms import step
+from sbi_active.campaign import Campaign, CampaignOptions, StopRules
 from sbi_active.campaign.options import CampaignDetails
 from sbi_active.messages import RenamedWarning
+from sbi_active.simulation import SimulatorModel
 from tests.campaign.problem import ACTIONS, OPTIONS, PRIOR, campaign, draws, noisy
 
 

@@ -5,15 +5,10 @@ import torch
 from sbi.utils import BoxUniform
 from sklearn.decomposition import PCA
 
-from sbi_active import (
-    Campaign,
-    CampaignOptions,
-    DiscreteActions,
-    MixedActions,
-    RefinementOptions,
-    SimulatorModel,
-)
-from sbi_active.actions import SummaryAction
+from sbi_active.actions import DiscreteActions, MixedActions, SummaryAction
+from sbi_active.campaign import Campaign, CampaignOptions
+from sbi_active.inference import RefinementOptions
+from sbi_active.simulation import SimulatorModel
 from sbi_active.simulation.workers.store import SimulationBudgetError
 from sbi_active.tasks import get_task
 from tests.effects import BIAS

@@ -5,12 +5,7 @@ import pytest
 import torch
 from sbi.utils import BoxUniform
 
-from sbi_active import (
-    AutocorrelatedNoise,
-    DiscreteActions,
-    GaussianNoise,
-    SimulatorModel,
-)
+from sbi_active.actions import DiscreteActions
 from sbi_active.criticism import (
     AugmentedSimulator,
     Criticism,
@@ -20,6 +15,7 @@ from sbi_active.criticism import (
 )
 from sbi_active.criticism.report.sections import figures
 from sbi_active.criticism.rivals.trial_simulator import TrialSimulator
+from sbi_active.simulation import AutocorrelatedNoise, GaussianNoise, SimulatorModel
 from tests.criticism.motor_world import LIBRARY, MODEL, PRIOR, measured
 from tests.effects import effect, normal
 

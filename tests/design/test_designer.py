@@ -1,15 +1,9 @@
 import pytest
 import torch
 
-from sbi_active import (
-    BoxActions,
-    DiscreteActions,
-    InformationGainDesigner,
-    MixedActions,
-    RandomDesigner,
-    SimulatorModel,
-)
-from sbi_active.simulation import Simulations
+from sbi_active.actions import BoxActions, DiscreteActions, MixedActions
+from sbi_active.design import InformationGainDesigner, RandomDesigner
+from sbi_active.simulation import Simulations, SimulatorModel
 from sbi_active.tasks.numerical.exact import ExactPosterior
 from sbi_active.tasks.numerical.task import NumericalTask
 from tests.linear_gaussian import (

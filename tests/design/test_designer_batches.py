@@ -6,15 +6,11 @@ import pytest
 import torch
 from torch.distributions import MultivariateNormal, Normal
 
-from sbi_active import (
-    AutocorrelatedNoise,
-    DiscreteActions,
-    InformationGainDesigner,
-    SimulatorModel,
-)
-from sbi_active.design import LikelihoodGain
+from sbi_active.actions import DiscreteActions
+from sbi_active.design import InformationGainDesigner, LikelihoodGain
 from sbi_active.design.estimators.base import CandidateSimulations
 from sbi_active.design.outcomes import JointLikelihood, conditional_gain, join_outcomes
+from sbi_active.simulation import AutocorrelatedNoise, SimulatorModel
 from tests.linear_gaussian import PRIOR, require_near
 
 ANGLES = DiscreteActions([0.0, 0.25, 1.0], names=["angle"])

@@ -5,16 +5,10 @@ import torch
 from sbi.utils import BoxUniform
 from torch.distributions import MultivariateNormal
 
-from sbi_active import (
-    BoxActions,
-    DiscreteActions,
-    GaussianNoise,
-    InformationGainDesigner,
-    MixedActions,
-    SimulatorModel,
-)
-from sbi_active.design import GradientSearch, Search
+from sbi_active.actions import BoxActions, DiscreteActions, MixedActions
+from sbi_active.design import GradientSearch, InformationGainDesigner, Search
 from sbi_active.design.search import Evaluations, Objective
+from sbi_active.simulation import GaussianNoise, SimulatorModel
 from sbi_active.tasks.numerical.task import NumericalTask
 from tests.design.test_designer import Exact
 from tests.linear_gaussian import PRIOR, ExactModel, require_near, simulator

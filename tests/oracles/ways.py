@@ -16,18 +16,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from sbi_active import (
-    BoxActions,
-    Campaign,
-    CampaignOptions,
-    MixtureDensity,
-    RefinementOptions,
-    SimulatorModel,
-    simulate,
-)
+from sbi_active.actions import BoxActions
+from sbi_active.campaign import Campaign, CampaignOptions
 from sbi_active.campaign.options import CampaignDetails
 from sbi_active.criticism import Criticism, Trials, identify
-from sbi_active.inference import refine
+from sbi_active.inference import MixtureDensity, RefinementOptions, refine
+from sbi_active.simulation import SimulatorModel, simulate
 from tests.oracles.judging import Found
 from tests.oracles.noise import Normal, Student
 from tests.oracles.problem import Problem

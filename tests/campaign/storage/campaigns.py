@@ -3,14 +3,11 @@
 import torch
 from sbi.utils import BoxUniform
 
-from sbi_active import (
-    BoxActions,
-    Campaign,
-    CampaignOptions,
-    MixtureDensity,
-    SimulatorModel,
-)
+from sbi_active.actions import BoxActions
+from sbi_active.campaign import Campaign, CampaignOptions
 from sbi_active.campaign.options import CampaignDetails
+from sbi_active.inference import MixtureDensity
+from sbi_active.simulation import SimulatorModel
 from tests.campaign.problem import REFINEMENT
 
 PRIOR = BoxUniform(torch.zeros(2), torch.ones(2))

@@ -7,15 +7,9 @@ import pytest
 import torch
 from sbi.utils import BoxUniform
 
-from sbi_active import (
-    BoxActions,
-    Campaign,
-    CampaignOptions,
-    DiscreteActions,
-    GaussianNoise,
-    RefinementOptions,
-    SimulatorModel,
-)
+from sbi_active.actions import BoxActions, DiscreteActions
+from sbi_active.campaign import Campaign, CampaignOptions
+from sbi_active.inference import RefinementOptions
 from sbi_active.inference.emulation.checks import _of_few
 from sbi_active.inference.emulation.emulator import EmulatedLikelihood, emulated
 from sbi_active.inference.emulation.pool import TrialRows
@@ -25,6 +19,7 @@ from sbi_active.inference.emulation.solving import around, whole_space
 from sbi_active.inference.emulation.stages import FEW_ROWS, largest_error
 from sbi_active.inference.engine.learned import learned_fit
 from sbi_active.inference.sampling.coordinates import PriorCoordinates
+from sbi_active.simulation import GaussianNoise, SimulatorModel
 
 EDGE = -0.4
 FEW = RefinementOptions(num_histories=400, num_effective=50)
