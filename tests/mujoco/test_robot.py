@@ -68,13 +68,14 @@ def armature(spec, value):
     spec.joint("hinge").armature = value
 
 
-@pytest.mark.parametrize(
-    ("edit", "old", "new", "is_affine"),
-    [
-        (armature, 'damping="0.03"', 'damping="0.03" armature="{}"', True),
-        (length, "0 0 -.5", "0 0 -{}", False),
-    ],
-)
+#: Edits, the same in the text, and whether one is affine.
+EDITS = [
+    (armature, 'damping="0.03"', 'damping="0.03" armature="{}"', True),
+    (length, "0 0 -.5", "0 0 -{}", False),
+]
+
+
+@pytest.mark.parametrize(("edit", "old", "new", "is_affine"), EDITS)
 def test_what_only_the_spec_says_is_written_or_compiled(edit, old, new, is_affine):
     robot = pendulum(parameters={"value": (0.3, 0.7, edit)})
     theta = torch.tensor([[0.35], [0.62]], dtype=torch.float64)

@@ -23,8 +23,7 @@ from sbi_active.criticism import Criticism, Trials, identify
 from sbi_active.inference import MixtureDensity, RefinementOptions, refine
 from sbi_active.simulation import SimulatorModel, simulate
 from tests.oracles.judging import Found
-from tests.oracles.noise import Normal, Student
-from tests.oracles.problem import Problem
+from tests.oracles.problem import Normal, Problem, Student
 from tests.oracles.reference import Students, Weighted, covariance, searched
 
 #: Draws of each belief.

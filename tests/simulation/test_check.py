@@ -46,13 +46,14 @@ def mixed(theta, action, seeds):
     return theta * action + noise
 
 
-@pytest.mark.parametrize(
-    ("simulator", "seeds"),
-    [
-        (noisy, "seeds: no argument"),
-        (SimulatorModel(row, batched=False), "seeds: one a row"),
-    ],
-)
+#: Simulators, and what is said of their seeds.
+CLEAN = [
+    (noisy, "seeds: no argument"),
+    (SimulatorModel(row, batched=False), "seeds: one a row"),
+]
+
+
+@pytest.mark.parametrize(("simulator", "seeds"), CLEAN)
 def test_a_clean_simulator_is_ready(simulator, seeds):
     report = check(simulator)
     assert report.is_ready

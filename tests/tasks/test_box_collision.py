@@ -10,7 +10,7 @@ from torch.distributions import Normal
 
 from sbi_active import SimulatorModel, simulate
 from sbi_active.criticism import AugmentedSimulator
-from sbi_active.tasks import get_task  # pyright: ignore
+from sbi_active.tasks import get_task
 from sbi_active.tasks.box_collision import BoxCollisionReference
 from sbi_active.tasks.box_collision.model import positions
 from sbi_active.tasks.box_collision.scene import LocalScene

@@ -14,8 +14,8 @@ from torch.distributions import MultivariateNormal
 
 from sbi_active import simulate
 from sbi_active.criticism import AugmentedSimulator
-from sbi_active.tasks import get_task  # pyright: ignore
-from sbi_active.tasks.ball_drops import fall  # pyright: ignore
+from sbi_active.tasks import get_task
+from sbi_active.tasks.ball_drops import fall
 from sbi_active.tasks.chain import model
 from sbi_active.tasks.numerical.exact import ExactPosterior, noise_free
 from sbi_active.tasks.numerical.exact_evidence import RESPONSES

@@ -148,13 +148,14 @@ def long(**changes):
     return pd.DataFrame({**columns, **changes})
 
 
-@pytest.mark.parametrize(
-    ("ids", "names"),
-    [
-        ([20261101.0, 20261102.0], ("20261101", "20261102")),
-        ([1e15, 1e15 + 1], ("1000000000000000", "1000000000000001")),
-    ],
-)
+#: Numbers, and the names of trials.
+DIGITS = [
+    ([20261101.0, 20261102.0], ("20261101", "20261102")),
+    ([1e15, 1e15 + 1], ("1000000000000000", "1000000000000001")),
+]
+
+
+@pytest.mark.parametrize(("ids", "names"), DIGITS)
 def test_numbers_that_name_trials_keep_their_digits(ids, names):
     trials = Trials.from_dataframe(long(trial=np.repeat(ids, 2)))
     assert trials.names == names

@@ -75,13 +75,14 @@ def test_noise_effects_stretch_the_noise():
     assert float(x.std()) == pytest.approx(0.3, abs=4 * 0.3 / math.sqrt(8_000))
 
 
-@pytest.mark.parametrize(
-    ("wrong", "size"),
-    [
-        (effect(null=0.5), "0.5"),
-        (effect(apply=lambda x, phi, a, c: x + phi + 0.25), "0.25"),
-    ],
-)
+#: Effects, and by how much they change what they should not.
+NOT_NESTED = [
+    (effect(null=0.5), "0.5"),
+    (effect(apply=lambda x, phi, a, c: x + phi + 0.25), "0.25"),
+]
+
+
+@pytest.mark.parametrize(("wrong", "size"), NOT_NESTED)
 def test_an_effect_that_does_not_vanish_is_named_with_its_size(wrong, size):
     check = PRIOR.sample((16,)), ACTIONS.sample((16,), seed=0)
     with pytest.raises(ValueError, match=f"effect 'bias' to vanish.*up to {size}"):

@@ -17,7 +17,7 @@ from sbi_active.criticism.linear.mixture import integrated
 from sbi_active.criticism.linear.processes import Grams, Processes
 from sbi_active.inference.sampling.mixtures import draws_between
 from sbi_active.mujoco import randomization
-from tests.criticism.linear.linear_models import linear_model
+from tests.criticism.linear.test_errors import linear_model
 from tests.effects import autocorrelated, on_outcomes
 
 WHITE = Processes(np.ones(1), np.zeros(1), np.full(1, np.inf), np.zeros(1, bool))

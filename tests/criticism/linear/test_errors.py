@@ -14,6 +14,7 @@ from sbi_active.criticism.data.trials import Trials
 from sbi_active.criticism.linear.errors import Errors
 from sbi_active.criticism.linear.left_out import leave_out
 from sbi_active.criticism.linear.mixture import WIDTHS, integrated
+from sbi_active.criticism.linear.model import LinearModel
 from sbi_active.criticism.linear.processes import (
     Filter,
     Filters,
@@ -21,14 +22,33 @@ from sbi_active.criticism.linear.processes import (
     time_scales,
     white_variance,
 )
+from sbi_active.criticism.results import ModelKey
 from sbi_active.criticism.rivals.error_models import LOG_2PI, NoiseCell, NoiseGrid
-from tests.criticism.linear.linear_models import linear_model
 
 NUM, SAMPLES = 7, 5
 KERNELS = (
     lambda d: np.exp(-d),
     lambda d: (1 + np.sqrt(3) * d) * np.exp(-np.sqrt(3) * d),
 )
+
+
+def linear_model(residual, jacobian, **changes) -> LinearModel:
+    """Return a model whose priors are wide and unbounded, but for changes."""
+    num, dim = jacobian.shape
+    parts = {
+        "key": ModelKey(),
+        "u": np.zeros(dim),
+        "center": np.zeros(dim),
+        "sd": np.full(dim, 1e3),
+        "scaled": np.zeros(dim, bool),
+        "low": np.full(dim, -np.inf),
+        "high": np.full(dim, np.inf),
+        "trial_of": np.full(dim, -1),
+        "scale": np.ones(num),
+        "offset": np.zeros(num),
+    }
+    given = {"residual": residual, "jacobian": jacobian, "num": num}
+    return LinearModel(**(parts | given | changes))
 
 
 def problem(*, low=-np.inf, ragged=False):

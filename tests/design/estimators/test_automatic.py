@@ -78,13 +78,14 @@ def test_a_ratio_beyond_the_reach_of_info_nce_is_averaged():
     assert "at 1 of 2 actions" in notes[-1]
 
 
-@pytest.mark.parametrize(
-    ("estimator", "text"),
-    [
-        (InfoNCEGain(num_contrastive=63), "near its largest value, log K = 4.2"),
-        (LikelihoodGain(num_contrastive=64), "near log L = 4.2 nats or above"),
-    ],
-)
+#: Estimators, and what is said of their estimate.
+LIMITED = [
+    (InfoNCEGain(num_contrastive=63), "near its largest value, log K = 4.2"),
+    (LikelihoodGain(num_contrastive=64), "near log L = 4.2 nats or above"),
+]
+
+
+@pytest.mark.parametrize(("estimator", "text"), LIMITED)
 def test_an_estimate_near_its_limit_is_said_to_be(estimator, text):
     model = ExactLikelihood()
     far, near = candidates(FAR, 512), candidates(NEAR, 512)
@@ -110,13 +111,14 @@ def test_a_ratio_whose_normalization_is_off_is_noticed():
     assert "nats below" in notes[0]
 
 
-@pytest.mark.parametrize(
-    ("former", "name", "kind"),
-    [
-        ("variational_nested", "likelihood", LikelihoodGain),
-        ("contrastive", "info_nce", InfoNCEGain),
-    ],
-)
+#: Former names, names, and estimators.
+FORMER = [
+    ("variational_nested", "likelihood", LikelihoodGain),
+    ("contrastive", "info_nce", InfoNCEGain),
+]
+
+
+@pytest.mark.parametrize(("former", "name", "kind"), FORMER)
 def test_a_former_name_is_taken_for_one_version(former, name, kind):
     with pytest.warns(DeprecationWarning, match=f'use estimator="{name}"'):
         assert type(find_estimator(former)) is kind

@@ -12,8 +12,8 @@ import torch
 from sbi_active.design import LikelihoodGain, RatioGain
 from sbi_active.design.estimators.base import standard_error
 from sbi_active.design.estimators.contrast import InfoNCEGain
-from tests.design.fragile import PRIOR as FRAGILE_PRIOR
-from tests.design.fragile import Fragile, log_normal
+from tests.design.test_outcomes import PRIOR as FRAGILE_PRIOR
+from tests.design.test_outcomes import Fragile, log_normal
 from tests.linear_gaussian import (
     PRIOR,
     ExactLikelihood,

@@ -258,14 +258,15 @@ def trained(make):
     return trainer
 
 
+#: Trainers, simulators, and what is told.
+UPDATES = [
+    *[(make, None, -3e38) for make in (ASBI, ALHI, SeqBED, SeqBED_LFIRE)],
+    *[(ASBI, problem.MODEL, x) for x in SIZES],
+]
+
+
 @pytest.mark.filterwarnings("ignore")
-@pytest.mark.parametrize(
-    ("make", "simulator", "x"),
-    [
-        *[(make, None, -3e38) for make in (ASBI, ALHI, SeqBED, SeqBED_LFIRE)],
-        *[(ASBI, problem.MODEL, x) for x in SIZES],
-    ],
-)
+@pytest.mark.parametrize(("make", "simulator", "x"), UPDATES)
 def test_updates_give_a_belief_to_go_on_from(make, simulator, x):
     trainer = trained(make)
     told = {"simulator": simulator, "refinement": SETTINGS, "seed": 1}
