@@ -111,12 +111,9 @@ def test_every_command_that_is_written_down_names_a_benchmark():
 # README's table is what committed rows say, and holds what is stated of it
 
 
-README = Path(__file__).parents[2] / "README.md"
-
-
 def test_readme_shows_the_rows_and_no_value_is_missed():
     lines, misses = readme.table()
-    assert "\n" + "\n".join(lines) + "\n\n" in README.read_text()
+    assert "\n" + "\n".join(lines) + "\n\n" in (ROOT / "README.md").read_text()
     assert not misses
 
 

@@ -36,9 +36,8 @@ def campaign(method="nsbi", simulator=MODEL, *, actions=ACTIONS, given=None, **c
     """Return a campaign with options changed, and further arguments given."""
     network = RATIOS if method == "seqbed" else OPTIONS.density_estimator
     options = evolve(OPTIONS, **{"density_estimator": network, **changes})
-    return Campaign(
-        simulator, PRIOR, actions, method=method, options=options, **(given or {})
-    )
+    given = {"method": method, "options": options, **(given or {})}
+    return Campaign(simulator, PRIOR, actions, **given)
 
 
 def draws(c, num=300):

@@ -156,9 +156,8 @@ def test_a_task_gives_its_simulator_and_prior(compared):
     (given,), task = compared, get_task("numerical")
     theta, action = task.prior.sample((3,)), given.trials.action
     assert torch.equal(given.prior.log_prob(theta), task.prior.log_prob(theta))
-    own, known = (
-        model.mean(theta, action) for model in (given.simulator, task.simulator)
-    )
+    models = given.simulator, task.simulator
+    own, known = (model.mean(theta, action) for model in models)
     assert torch.equal(own, known)
     assert given.effects
 

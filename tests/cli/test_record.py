@@ -14,9 +14,8 @@ from sbi_active.cli import main, record
 from sbi_active.cli.problem import open_campaign
 from tests.cli.sled import BOX, SIMULATOR, SMALL, forget, forked, made_at, read, run
 
-TWO = SIMULATOR.replace("    return ", "    x = ") + (
-    "    return torch.stack([x[:, 0], 2 * x[:, 0]], 1)\n"
-)
+TWO = SIMULATOR.replace("    return ", "    x = ")
+TWO += "    return torch.stack([x[:, 0], 2 * x[:, 0]], 1)\n"
 
 
 @pytest.fixture(scope="module")

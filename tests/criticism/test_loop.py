@@ -102,9 +102,8 @@ def test_nothing_is_added_to_a_right_model():
 
 def test_the_augmented_simulator_and_its_prior_go_on():
     trials = measured(1, {"bias": 0.8})
-    report = close_loop(
-        MODEL, PRIOR, trials, effects=LIBRARY, evaluate=False, plan=False
-    )
+    given = {"effects": LIBRARY, "evaluate": False, "plan": False}
+    report = close_loop(MODEL, PRIOR, trials, **given)
     z = report.prior.sample((7,))
     assert report.verdict == "bias"
     assert z.shape == (7, 3)

@@ -73,9 +73,8 @@ def test_scatter_sums_out_the_size_of_a_larger_error():
     each = [exact(ACTION, X[:, 0], extra=NOISE * s) for s in sizes]
     # Eleven sizes stand for all.
     error = 0.1 + 3 * found.standard_error
-    assert found.log_evidence == pytest.approx(
-        logsumexp(each, b=1 / len(each)), abs=error
-    )
+    expected = logsumexp(each, b=1 / len(each))
+    assert found.log_evidence == pytest.approx(expected, abs=error)
 
 
 def inferred(seed):
@@ -108,9 +107,8 @@ def test_a_trial_without_a_measurement_costs_its_flag():
     x = X.clone()
     x[2] = torch.nan
     keep = x[:, 0].isfinite()
-    require_evidence(
-        rivals(line, Trials(ACTION, x)), exact(ACTION[keep], X[keep, 0]) + FLAG
-    )
+    kept = exact(ACTION[keep], X[keep, 0])
+    require_evidence(rivals(line, Trials(ACTION, x)), kept + FLAG)
 
 
 def test_a_measurement_where_there_should_be_none_has_the_prior_predictive():

@@ -90,7 +90,6 @@ def test_joint_noise_keeps_its_time_axis():
 
 NUM = 300
 TIMES = torch.linspace(0.1, 1.0, NUM)
-BELIEF = MultivariateNormal(torch.zeros(2), torch.eye(2))
 BASIS = torch.stack([TIMES, torch.sin(8 * TIMES)])
 
 
@@ -107,7 +106,7 @@ def test_a_linear_model_tells_what_it_tells_in_closed_form():
     model = SimulatorModel(line, noise=2.0)
     actions = DiscreteActions([0.2, 1.0, 3.0])
     designer = InformationGainDesigner(actions, num_samples=1_000)
-    design = designer.select(None, model, belief=BELIEF, seed=0)
+    design = designer.select(None, model, belief=PRIOR, seed=0)
     error = design.standard_error.nan_to_num(0.0)
     for k, action in enumerate((0.2, 1.0, 3.0)):
         gain = float(design.expected_information_gain[k])

@@ -196,9 +196,8 @@ def test_dropping_invalid_rows_reverses_the_choice(world):
     gain = PosteriorGain()(world, rows, PRIOR)
     valid = rows.x[..., 0].isfinite()
     dropped = (gain * valid).sum(1) / valid.sum(1)
-    error = torch.stack(
-        [standard_error(g[v]) for g, v in zip(gain, valid, strict=True)]
-    )
+    pairs = zip(gain, valid, strict=True)
+    error = torch.stack([standard_error(g[v]) for g, v in pairs])
     assert ((dropped - exact["dropped"]).abs() < 4 * error).all()
     assert int(dropped.argmax()) == 3
     assert dropped[3] > dropped[2] + 1.0
@@ -216,9 +215,7 @@ def test_missing_rows_are_dropped_and_not_invalid():
             assert (distance < 4 * error).all()
             assert (distance > -slack - 4 * error).all()
         # negative control: counted as invalid they mislead
-        wrong = CandidateSimulations(
-            rows.theta, rows.action, rows.x, rows.mean, rows.noise, rows.replicate
-        )
+        wrong = replace(rows, missing=None)
         mean, error = estimate(world, PosteriorGain(), wrong)
         assert ((mean - world.exact()["counted"]).abs() > 6 * error).any()
 

@@ -9,6 +9,7 @@ import subprocess
 import time
 from contextlib import contextmanager
 from html import unescape
+from html.parser import HTMLParser
 from pathlib import Path
 from urllib.error import URLError
 from urllib.request import Request, urlopen
@@ -150,3 +151,31 @@ def said(url: str, content, method: str = "POST"):
     data = None if content is None else json.dumps(content).encode()
     with urlopen(Request(url, data, method=method), timeout=120) as answer:
         return json.loads(answer.read())["value"]
+
+
+# The elements and texts of a page
+
+
+VOID = {"br", "img", "meta"}
+
+
+class Parsed(HTMLParser):
+    """Tags with their attributes, and texts, of a page that must be balanced."""
+
+    def __init__(self, page):
+        super().__init__()
+        self.elements, self.open, self.texts = [], [], []
+        self.feed(page)
+        self.close()
+        assert not self.open
+
+    def handle_starttag(self, tag, attrs):
+        self.elements.append((tag, dict(attrs)))
+        if tag not in VOID:
+            self.open.append(tag)
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+    def handle_data(self, data):
+        self.texts.append(data)

@@ -18,8 +18,7 @@ from sbi_active.display.figures import legible
 from sbi_active.display.notebook import badge, card, facts, items, table
 from tests.campaign.storage.campaigns import MODEL, OPTIONS, PRIOR, go_on, new, outcome
 from tests.criticism.report.reports import report
-from tests.display.browser import CHROMIUM, assert_reads_well, look
-from tests.display.parsed import Parsed
+from tests.display.browser import CHROMIUM, Parsed, assert_reads_well, look
 
 TABLE = Table(("model", "P"), [("bare", 0.25), ("drag|lift", "0.7")])
 

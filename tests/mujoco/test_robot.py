@@ -115,9 +115,8 @@ def test_signals_drive_actuators():
         inputs=space.inputs(action),
         input_times=space.input_times,
     )
-    again = robot.simulator.mean(
-        theta, trials.action, inputs=trials.inputs, input_times=trials.input_times
-    )
+    played = {"inputs": trials.inputs, "input_times": trials.input_times}
+    again = robot.simulator.mean(theta, trials.action, **played)
     assert (again == x).all()
 
 

@@ -194,10 +194,8 @@ def test_an_alarm_switches_the_stop_rules_off():
 
 
 DENSITY = MixtureDensity(hidden_features=(16,), num_components=2, num_iterations=150)
-TRAINED = {
-    **dict.fromkeys(("asbi", "nsbi", "alhi", "nlhi"), DENSITY),
-    "seqbed": problem.RATIOS,
-}
+TRAINED = dict.fromkeys(("asbi", "nsbi", "alhi", "nlhi"), DENSITY)
+TRAINED["seqbed"] = problem.RATIOS
 FEW = evolve(problem.RATIOS, num_iterations=5)
 QUICK = {**dict.fromkeys(TRAINED, problem.OPTIONS.density_estimator), "seqbed": FEW}
 GAINS = {"asbi": "posterior", "alhi": "likelihood", "seqbed": "ratio"}

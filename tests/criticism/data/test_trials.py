@@ -161,9 +161,8 @@ def trials(inputs, input_times=FINE, **keywords):
 @pytest.mark.parametrize("action", [None, torch.ones(2)])
 def test_without_actions_the_action_is_a_label(action):
     found = Trials(action, X, inputs=torch.zeros(2, 11), input_times=FINE)
-    assert (
-        found.action_is_label == found.select([1]).action_is_label == (action is None)
-    )
+    is_label = found.action_is_label, found.select([1]).action_is_label
+    assert is_label == (action is None,) * 2
     assert found.action[:, 0].tolist() == ([0, 1] if action is None else [1, 1])
     assert found.repeat_of.tolist() == [-1, 0]
     other = Trials(action, X, inputs=torch.randn(2, 11), input_times=FINE)

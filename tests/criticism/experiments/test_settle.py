@@ -97,9 +97,8 @@ def test_a_registered_prediction_is_that_of_linear_least_squares():
     design = torch.cat([FORWARD, FORMS["drag"](FORWARD)], 1).double()
     new = torch.tensor([float(own.action[0])]).double()
     new = torch.stack([new, FORMS["drag"](new)], 1)
-    cov = torch.linalg.inv(
-        design.T @ design / NOISE**2 + torch.diag(torch.tensor([0.0, 1.0]))
-    )
+    prior = torch.diag(torch.tensor([0.0, 1.0]))
+    cov = torch.linalg.inv(design.T @ design / NOISE**2 + prior)
     mean = new @ cov @ design.T @ trials.x.double() / NOISE**2
     sd = float((NOISE**2 + new @ cov @ new.T).sqrt())
     assert own.verdict == "drag"
@@ -144,9 +143,8 @@ def test_an_effect_is_withdrawn_by_the_rule_that_named_it():
         assert after(*tested).verdict == "lag"
     for tested in ([off(1.1 * remaining)], [off(0.2), off(0.4)]):
         assert after(*tested).verdict == "unexplained"
-    exact = replace(
-        trial, registered=replace(own, without={"lag": own.mean}), x=own.mean
-    )
+    own_exact = replace(own, without={"lag": own.mean})
+    exact = replace(trial, registered=own_exact, x=own.mean)
     assert after(exact).verdict == "unexplained"  # without it predicted as well
     found = after(replace(trial, registered=replace(own, without={})))
     assert (found.verdict, found.tracing.beside) == ("unexplained", ("lag",))

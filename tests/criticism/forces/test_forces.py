@@ -116,9 +116,7 @@ def forces(pushed):
 
 
 def test_only_what_outgrows_damping_and_drives_is_bounded(forces):
-    bounds = {
-        name: coordinates.dissipative_bounds(effect) for name, effect in forces.items()
-    }
+    bounds = {k: coordinates.dissipative_bounds(e) for k, e in forces.items()}
     for name in ("v|v| of hinge", "v^3 of hinge"):
         low, high = bounds.pop(name)
         assert low.tolist() == [-np.inf], name

@@ -90,9 +90,8 @@ def dense(model, covariances, sds):
             whole = noise + design @ prior @ design.T
             gain = prior @ design.T @ np.linalg.inv(whole)
             log_p = multivariate_normal(cov=whole).logpdf(off)
-            found.append(
-                (log_p, model.center + gain @ off, prior - gain @ design @ prior)
-            )
+            cov = prior - gain @ design @ prior
+            found.append((log_p, model.center + gain @ off, cov))
     return [np.array(part) for part in zip(*found, strict=True)]
 
 

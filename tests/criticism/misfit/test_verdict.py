@@ -253,9 +253,8 @@ def test_a_bound_of_phi_is_told_and_its_null_is_none():
     assert loop.trace().chosen == ("drag",)
     tracing = beyond(loop, replace(loop.trace(), chosen=("drag",)))
     # Asked first of all, it has the posteriors as well.
-    assert (
-        criticism(friction(0.1), effect=strong, drag=0.3).judged(None).bounds.parameters
-    )
+    first = criticism(friction(0.1), effect=strong, drag=0.3).judged(None)
+    assert first.bounds.parameters
     (found,) = [p for p in tracing.bounds.parameters if p.name == "drag"]
     assert (found.model, found.side) == ("drag", "upper")
     assert found.beyond > 0.15
@@ -283,6 +282,5 @@ def test_a_simulator_that_refuses_what_is_beyond_is_asked_no_more():
 def test_a_bare_model_that_explains_at_its_bound_says_so(low, is_said):
     report = criticism(friction(low)).report(plan=False)
     assert report.verdict == NONE
-    assert (
-        ("SA103" in codes(report)) == is_said == bool(report.tracing.bounds.parameters)
-    )
+    told = report.tracing.bounds.parameters
+    assert ("SA103" in codes(report)) == is_said == bool(told)

@@ -176,9 +176,8 @@ def test_an_action_that_some_draws_alone_chose_is_chosen_again(
 
 
 FINE = 0.01
-ANGLES = DiscreteActions(
-    torch.linspace(0.2, 1.2, 11).double(), names=["angle"], units=["rad"]
-)
+ANGLES = torch.linspace(0.2, 1.2, 11).double()
+ANGLES = DiscreteActions(ANGLES, names=["angle"], units=["rad"])
 STEP, SAMPLES, EVERY = 0.08, 8, 3
 
 

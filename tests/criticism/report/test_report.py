@@ -19,7 +19,7 @@ from sbi_active.display.panels import AFTER, BEFORE, plot_residuals
 from tests.criticism import block
 from tests.criticism.report.reports import DRAG, report, residuals, tracing
 from tests.criticism.slope_world import MODEL, NOISE, PRIOR, read
-from tests.display.parsed import Parsed
+from tests.display.browser import Parsed
 from tests.effects import BIAS
 
 TESTS = (SevereTest(action=np.array([3.0]), is_permitted=True, difference=1.234),)
@@ -126,9 +126,8 @@ def decided(form, *, prior=PRIOR, fitted=9, held_out=4):
     num = fitted + held_out
     action = ACTIONS.values[torch.randperm(9, generator=gen).repeat(2)[:num]]
     mean = form(action, torch.arange(num)[:, None] < fitted)
-    trials = Trials(
-        action, read(mean, gen), role=["fit"] * fitted + ["held out"] * held_out
-    )
+    role = ["fit"] * fitted + ["held out"] * held_out
+    trials = Trials(action, read(mean, gen), role=role)
     report = close_loop(MODEL, prior, trials, effects=[BIAS], plan=False)
     assert report.to_dict()["gate"] == json.loads(json.dumps(report.gate.to_dict()))
     assert report.gate.exit_code == EXIT_CODES[report.gate.decision]

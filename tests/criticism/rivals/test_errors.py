@@ -107,9 +107,8 @@ def test_a_posterior_over_the_size_is_summed_out_by_draws():
     scale = float(repeats.std()) ** 2 * np.eye(3)
     expected = stats.multivariate_t(np.zeros(3), scale, df=59).logpdf(m.x)
     # A size known to 9 % has a density known to .16 nats a draw, here.
-    assert log_likelihood(estimate_noise(repeats), m) == pytest.approx(
-        expected, abs=0.15
-    )
+    found = log_likelihood(estimate_noise(repeats), m)
+    assert found == pytest.approx(expected, abs=0.15)
     # Its draws may have no axis of parameters.
     size = torch.distributions.LogNormal(np.log(0.3), 0.1)
     grid = declared_noise(GaussianNoise(0.3, posterior=size), m)

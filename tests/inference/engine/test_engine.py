@@ -141,9 +141,8 @@ def test_a_mode_that_draws_miss_is_told_by_those_of_other_proposals(width, misse
     rng, pool = np.random.default_rng(0), Pool.empty(1)
     given = Given(lambda u: 40 * (u**2 - 1), 1, 1)  # modes at -1 and 1
     for place, scale in ((1.0, width), (-1.0, 1.0)):
-        drawn_from = StudentMixture(
-            np.full((1, 1), place), np.full((1, 1, 1), scale), np.ones(1), np.inf
-        )
+        at, factor = np.full((1, 1), place), np.full((1, 1, 1), scale)
+        drawn_from = StudentMixture(at, factor, np.ones(1), np.inf)
         drawn = drawn_from.sample(4_000, rng)
         pool.add(drawn_from, drawn, given, is_final=place == 1)
     assert pool.missed == pytest.approx(missed, abs=0.1)
@@ -293,9 +292,8 @@ def test_few_draws_have_no_surface():
     own, rng = bent(), np.random.default_rng(0)
     pool = Pool.empty(6)
     pool.add(PriorDraws(own), SUMS + 0.1 * rng.standard_normal((10, 6)), own)
-    assert (
-        surfaces.fitted_surface(own, lambda r: r, pool, rng, SurfaceSettings()) is None
-    )
+    few = own, lambda r: r, pool, rng, SurfaceSettings()
+    assert surfaces.fitted_surface(*few) is None
 
 
 @pytest.mark.parametrize("shift", [0.0, 1.0, 30.0])
@@ -309,9 +307,8 @@ def test_weights_are_right_whatever_the_surface(shift):
     surface = surfaces.Surface(np.zeros(dim), np.eye(dim), 1, off, 0.0, 1.0)
     base = StudentMixture(np.zeros((1, dim)), np.eye(dim)[None])
     own = SurfaceSettings()
-    passed = surfaces.Screened(base, surfaces.SurfacePotential(prior, surface)).leveled(
-        rng, own
-    )
+    known = surfaces.SurfacePotential(prior, surface)
+    passed = surfaces.Screened(base, known).leveled(rng, own)
     u = passed.sample(20_000, rng)
     weight = np.exp(target.logpdf(u) - passed.log_prob(u))
     error = np.hypot(weight.std() / len(u) ** 0.5, passed.error)

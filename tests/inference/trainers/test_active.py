@@ -249,9 +249,8 @@ def trained(make):
         trainer = SeqBED_LFIRE(problem.PRIOR)
         theta, action = trainer.arrange(theta, action)
     else:
-        network = (
-            problem.RATIOS if make is SeqBED else problem.OPTIONS.density_estimator
-        )
+        network = problem.OPTIONS.density_estimator
+        network = problem.RATIOS if make is SeqBED else network
         trainer = make(problem.PRIOR, network, show_progress_bars=False)
     x = theta * action + 0.1 * torch.randn_like(theta)
     trainer.append_simulations(theta, x, action=action).train()

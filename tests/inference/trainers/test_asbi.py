@@ -164,9 +164,8 @@ def test_truncated_proposals_of_the_belief_pass_and_others_do_not():
     inference = trained(QUICK, prior=BOX)
     packed = inference.build_posterior().packed()
     packed.set_default_x(torch.tensor([[0.0, 0.0, 1.0]]))
-    restricted = RestrictedPrior(
-        BOX, get_density_thresholder(packed, num_samples_to_estimate_support=10_000)
-    )
+    region = get_density_thresholder(packed, num_samples_to_estimate_support=10_000)
+    restricted = RestrictedPrior(BOX, region)
     inference.append_simulations(theta, x, proposal=restricted, action=action)
     with pytest.raises(ValueError, match="expected proposal to be the belief"):
         inference.append_simulations(theta, x, proposal=packed, action=action)
