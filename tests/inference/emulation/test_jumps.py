@@ -83,6 +83,9 @@ def test_the_error_of_a_learned_likelihood_is_what_simulations_say():
     nothing = replace(rows, agrees=np.zeros(len(rows.z), dtype=bool))
     assert largest_error([fit], learned, [nothing], z) == np.inf
     assert largest_error([fit], learned, [rows], z + 1e-3) == np.inf
+    for off, holds in ((0.5, True), (3.0, False)):
+        doubts = _of_few(learned, FEW_ROWS, off)
+        assert doubts["likelihood_followed"][0] is holds
 
 
 # Noise that a learned likelihood does not follow, and beliefs that say so
