@@ -39,6 +39,20 @@ def added(name, form, sd=1.0, **changes):
     return on_outcomes(name, apply, sd, **changes)
 
 
+def drift(sd=1.0, **changes):
+    """Return an effect that adds its strength from trial to trial."""
+
+    def apply(x, phi, action, context):
+        return x + phi * context.index[:, None]
+
+    return on_outcomes("drift", apply, sd, **changes)
+
+
+def gain(sd=1.0):
+    """Return an effect that makes outcomes larger by a share."""
+    return on_outcomes("gain", lambda x, phi, *_: x * (1 + phi), sd)
+
+
 def louder(by=lambda phi, action: phi[:, :1], sd=1.0):
     """Return an effect that makes the noise larger by a share."""
 

@@ -8,6 +8,10 @@ import torch
 from torch import Tensor
 from torch.distributions import Distribution, MultivariateNormal
 
+from sbi_active import GaussianNoise
+from sbi_active.design import Design
+from sbi_active.design.estimators.base import CandidateSimulations
+
 DIM = 2
 PRIOR = MultivariateNormal(torch.zeros(DIM), torch.eye(DIM))
 
@@ -42,6 +46,23 @@ def information(action: Tensor) -> Tensor:
     return DIM * 0.5 * torch.log1p(action[:, 0] ** 2)
 
 
+def candidates(action, num, *, noise=torch.randn_like, declared=None, pairs=False):
+    """Return simulations of candidates, with the noise declared or in pairs."""
+    torch.manual_seed(0)
+    theta = PRIOR.sample((num,))
+    mean = action[:, None] * theta
+    x, again = (mean + noise(mean) for _ in "ab")
+    if declared is not None:
+        return CandidateSimulations(theta, action, x, mean, GaussianNoise(declared))
+    return CandidateSimulations(theta, action, x, replicate=again if pairs else None)
+
+
+def require_near(design: Design, exact: Tensor, bias: float = 1e-6) -> None:
+    """Require gains within four of their standard errors, and a bias, of exact ones."""
+    distance = (design.expected_information_gain - exact).abs()
+    assert (distance < 4 * design.standard_error + bias).all()
+
+
 class ExactModel:
     """The exact posterior as a model for the designer."""
 
@@ -55,13 +76,6 @@ class ExactModel:
         z = (theta - mean) / (self.spread * variance.sqrt())
         scale = 0.5 * variance.log() + math.log(self.spread)
         return (-0.5 * z**2 - scale - 0.5 * math.log(2 * math.pi)).sum(-1)
-
-    def sample_batched(
-        self, sample_shape: torch.Size, x: Tensor, action: Tensor, **options: object
-    ) -> Tensor:
-        mean, variance = moments(x, action)
-        sd = self.spread * variance.sqrt()
-        return mean + sd * torch.randn(*sample_shape, *mean.shape)
 
 
 class ExactLikelihood:
@@ -81,25 +95,8 @@ class ExactLikelihood:
         return log_normal(x - action * theta, self.spread)
 
 
-class ExactLikelihoodAndPosterior(ExactLikelihood):
-    """Both.
-
-    Args:
-        spread: Of the likelihood's noise, 1 is exact.
-        proposal: Of the posterior, 1 is exact.
-    """
-
-    def __init__(self, spread: float = 1.0, proposal: float = 1.0) -> None:
-        super().__init__(spread)
-        self._posterior = ExactModel(proposal)
-
-    def log_posterior(self, theta: Tensor, x: Tensor, action: Tensor) -> Tensor:
-        return self._posterior.log_posterior(theta, x, action)
-
-    def sample_batched(
-        self, sample_shape: torch.Size, x: Tensor, action: Tensor, **options: object
-    ) -> Tensor:
-        return self._posterior.sample_batched(sample_shape, x, action)
+class ExactLikelihoodAndPosterior(ExactLikelihood, ExactModel):
+    """Both."""
 
 
 class ExactRatio:

@@ -5,31 +5,30 @@ import pytest
 import torch
 from sbi.utils import BoxUniform
 
-from sbi_active import (
-    Campaign,
-    DiscreteActions,
-    InformationGainDesigner,
-    SimulatorModel,
-)
+from sbi_active.actions import DiscreteActions
 from sbi_active.arrays import distance_from, measured, own_tensor
+from sbi_active.campaign import Campaign
 from sbi_active.criticism import Trials
 from sbi_active.criticism.data.tables import read_trials
 from sbi_active.criticism.misfit.rule import Rule
+from sbi_active.design import InformationGainDesigner
 from sbi_active.mujoco import from_mjcf
+from sbi_active.simulation import SimulatorModel
 
 MASKED = np.ma.masked_array([1.0, 2.0], mask=[False, True])
 
 
-@pytest.mark.parametrize(
-    "given",
-    [
-        (1.0, np.float64(2.0)),
-        [torch.tensor(1.0), 2.0],
-        np.array([1, 2], dtype=">i2"),
-        np.array([1, 2], dtype=object),
-        torch.tensor([1.0, 2.0], requires_grad=True),
-    ],
-)
+#: One and two.
+NUMBERS = [
+    (1.0, np.float64(2.0)),
+    [torch.tensor(1.0), 2.0],
+    np.array([1, 2], dtype=">i2"),
+    np.array([1, 2], dtype=object),
+    torch.tensor([1.0, 2.0], requires_grad=True),
+]
+
+
+@pytest.mark.parametrize("given", NUMBERS)
 def test_numbers_of_any_kind(given):
     assert measured(given).dtype == torch.float64
     assert measured(given).tolist() == [1.0, 2.0]
@@ -70,17 +69,18 @@ def slide(theta, action):
     return theta * action
 
 
-@pytest.mark.parametrize(
-    ("call", "wrong", "meant"),
-    [
-        (lambda **k: Campaign(slide, PRIOR, ACTIONS, **k), "metod", "method"),
-        (lambda **k: InformationGainDesigner(ACTIONS, **k), "estimators", "estimator"),
-        (lambda **k: SimulatorModel(slide, **k), "noize", "noise"),
-        (lambda **k: Trials([0.0], [0.0], **k), "sample_time", "sample_times"),
-        (lambda **k: from_mjcf("", {}, **k), "sensor", "sensors"),
-        (Rule, "chances", "chance"),
-    ],
-)
+#: Calls, a keyword, and the one that was meant.
+MISTYPED = [
+    (lambda **k: Campaign(slide, PRIOR, ACTIONS, **k), "metod", "method"),
+    (lambda **k: InformationGainDesigner(ACTIONS, **k), "estimators", "estimator"),
+    (lambda **k: SimulatorModel(slide, **k), "noize", "noise"),
+    (lambda **k: Trials([0.0], [0.0], **k), "sample_time", "sample_times"),
+    (lambda **k: from_mjcf("", {}, **k), "sensor", "sensors"),
+    (Rule, "chances", "chance"),
+]
+
+
+@pytest.mark.parametrize(("call", "wrong", "meant"), MISTYPED)
 def test_a_mistyped_keyword_is_told_with_the_one_that_was_meant(call, wrong, meant):
     with pytest.raises(TypeError, match=f"got '{wrong}'; did you mean '{meant}'"):
         call(**{wrong: None})

@@ -8,16 +8,11 @@ import torch
 import xarray as xr
 from sbi.utils import BoxUniform
 
-from sbi_active import (
-    BoxActions,
-    Campaign,
-    DiscreteActions,
-    GaussianNoise,
-    SimulatorModel,
-    to_datatree,
-    to_inference_data,
-)
+from sbi_active import to_datatree, to_inference_data
+from sbi_active.actions import BoxActions, DiscreteActions
+from sbi_active.campaign import Campaign
 from sbi_active.criticism import Trials, close_loop, generic_effects
+from sbi_active.simulation import GaussianNoise, SimulatorModel
 from tests.campaign.problem import OPTIONS
 
 matplotlib.use("Agg")
@@ -27,7 +22,7 @@ PRIOR = BoxUniform(torch.zeros(2), torch.ones(2))
 @pytest.fixture(scope="module")
 def campaign():
     names = {"parameter_names": ["mass", "friction"], "channel_names": ["x", "y"]}
-    model = SimulatorModel(lambda t, a: t * a, noise=GaussianNoise(0.2), **names)
+    model = SimulatorModel(lambda t, a: t * a, noise=0.2, **names)
     actions = DiscreteActions([1.0, 2.0], names=["push"])
     c = Campaign(model, PRIOR, actions, method="nsbi", options=OPTIONS)
     for _ in range(3):

@@ -4,24 +4,21 @@ import numpy as np
 import pytest
 import torch
 from attrs import evolve
+from scipy import stats
 
-from sbi_active import (
-    ALHI,
-    ASBI,
-    GaussianNoise,
-    InformationGainDesigner,
-    RandomDesigner,
-    SeqBED,
-    SimulatorModel,
-    simulate,
-    to_inference_data,
-)
+from sbi_active import seeding, to_inference_data
 from sbi_active.actions import BoxActions, MixedActions
 from sbi_active.criticism import Trials, close_loop
-from sbi_active.inference import refine
+from sbi_active.design import InformationGainDesigner, RandomDesigner
+from sbi_active.inference import ALHI, ASBI, SeqBED, refine
 from sbi_active.inference.rounds.rows import Observation
-from sbi_active.seeding import derive_seed
-from sbi_active.simulation import check_simulator, estimate_noise
+from sbi_active.simulation import (
+    GaussianNoise,
+    SimulatorModel,
+    check_simulator,
+    estimate_noise,
+    simulate,
+)
 from tests.campaign.problem import (
     ACTIONS,
     MODEL,
@@ -118,7 +115,7 @@ def test_simulators_and_noise(kept):
     kept("model", lambda: MODEL(THETA, ACTION, seeds=seeds))
     kept("mean", lambda: MODEL.mean(THETA, ACTION))
     kept("sample", lambda: GaussianNoise(0.1).sample(X, seeds))
-    kept("derive_seed", lambda: derive_seed(0, "key"))
+    kept("derive_seed", lambda: seeding.derive_seed(0, "key"))
     kept("estimate_noise", lambda: estimate_noise(X[:40].reshape(4, 10, 1)))
     kept("check_simulator", lambda: check_simulator(noisy, PRIOR, ACTIONS, seed=0))
 
@@ -143,3 +140,47 @@ def test_what_draws_as_in_sbi_and_torch():
         before = torch.get_rng_state()
         call()
         assert not torch.equal(before, torch.get_rng_state())
+
+
+# Seeds of rows, and generators that are forked
+
+
+def test_rows_depend_on_seed_and_index_alone():
+    together = seeding.row_normals(seeding.row_seeds(3, 100), 4)
+    apart = seeding.row_normals(seeding.row_seeds(3, 40, first=60), 4)
+    assert torch.equal(together[60:], apart)
+    assert not torch.equal(together, seeding.row_normals(seeding.row_seeds(4, 100), 4))
+
+
+def test_row_normals_are_standard_normal_and_uncorrelated():
+    draws = seeding.row_normals(seeding.row_seeds(1, 20_000), 5).numpy()
+    assert stats.kstest(draws.ravel(), "norm").pvalue > 1e-3
+    correlation = np.corrcoef(draws.T)[np.triu_indices(5, 1)]
+    assert np.abs(correlation).max() < 4 / np.sqrt(20_000)
+    # and along rows, whose seeds are neighbors
+    assert abs(np.corrcoef(draws[1:, 0], draws[:-1, 0])[0, 1]) < 4 / np.sqrt(20_000)
+
+
+def test_row_uniforms_are_uniform_and_continue_the_stream():
+    seeds = seeding.row_seeds(2, 20_000)
+    draws = seeding.row_uniforms(seeds, 4)
+    assert stats.kstest(draws.numpy().ravel(), "uniform").pvalue > 1e-3
+    assert torch.equal(seeding.row_uniforms(seeds, 2, first=2), draws[:, 2:])
+    assert torch.equal(seeding.row_uniforms(seeds[[7, 3]], 4), draws[[7, 3]])
+    normals = stats.norm.ppf(draws.numpy())
+    assert np.allclose(seeding.row_normals(seeds, 4).numpy(), normals, atol=1e-9)
+
+
+def test_fork_seeds_inside_and_restores_outside():
+    torch.manual_seed(5)
+    np.random.seed(5)
+    expected = torch.rand(1), np.random.rand()
+    torch.manual_seed(5)
+    np.random.seed(5)
+    with seeding.forked_generators(1, "key"):
+        first = torch.rand(3), np.random.rand(3)
+    with seeding.forked_generators(1, "key"):
+        second = torch.rand(3), np.random.rand(3)
+    assert torch.equal(first[0], second[0])
+    assert (first[1] == second[1]).all()
+    assert (torch.rand(1), np.random.rand()) == expected

@@ -43,7 +43,7 @@ AREAS: dict[str, tuple[str, ...]] = {
     "tables": ("tests/criticism/data",),
     "mujoco_robots": ("tests/mujoco",),
     "priors": ("tests/inference/beliefs", "tests/oracles"),
-    "process_state": ("tests/test_global_generators.py", "tests/test_seeding.py"),
+    "process_state": ("tests/test_global_generators.py",),
 }
 RESULTS = Path(__file__).parent / "results"
 LONGEST = 3_600.0  # s that all tests of an area may take

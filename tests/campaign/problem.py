@@ -4,21 +4,16 @@ import torch
 from attrs import evolve
 from sbi.utils import BoxUniform
 
-from sbi_active import (
-    Campaign,
-    CampaignOptions,
-    DiscreteActions,
-    GaussianNoise,
-    MixtureDensity,
-    RefinementOptions,
-    SimulatorModel,
-)
+from sbi_active.actions import DiscreteActions
+from sbi_active.campaign import Campaign, CampaignOptions
 from sbi_active.campaign.options import CampaignDetails
+from sbi_active.inference import MixtureDensity, RefinementOptions
 from sbi_active.inference.networks.ratio_network import RatioClassifier
+from sbi_active.simulation import SimulatorModel
 
 PRIOR = BoxUniform(torch.zeros(1), torch.ones(1))
 ACTIONS = DiscreteActions([0.5, 1.0, 3.0])
-MODEL = SimulatorModel(lambda theta, action: theta * action, noise=GaussianNoise(0.1))
+MODEL = SimulatorModel(lambda theta, action: theta * action, noise=0.1)
 REFINEMENT = RefinementOptions(num_histories=200, num_effective=25)
 DETAILS = CampaignDetails(num_scored=200)
 OPTIONS = CampaignOptions(
@@ -41,9 +36,8 @@ def campaign(method="nsbi", simulator=MODEL, *, actions=ACTIONS, given=None, **c
     """Return a campaign with options changed, and further arguments given."""
     network = RATIOS if method == "seqbed" else OPTIONS.density_estimator
     options = evolve(OPTIONS, **{"density_estimator": network, **changes})
-    return Campaign(
-        simulator, PRIOR, actions, method=method, options=options, **(given or {})
-    )
+    given = {"method": method, "options": options, **(given or {})}
+    return Campaign(simulator, PRIOR, actions, **given)
 
 
 def draws(c, num=300):

@@ -7,14 +7,7 @@ import torch
 from attrs import evolve
 from torch.distributions import MultivariateNormal
 
-from sbi_active import (
-    BoxActions,
-    Campaign,
-    DiscreteActions,
-    GaussianNoise,
-    SimulatorModel,
-    StopRules,
-)
+from sbi_active import BoxActions, Campaign, DiscreteActions, SimulatorModel, StopRules
 from sbi_active.campaign.options import CampaignDetails
 from sbi_active.cli.record import Record, answer_of, sum_up_campaign
 from tests.campaign.problem import ACTIONS, MODEL, OPTIONS, campaign
@@ -173,7 +166,7 @@ def test_pairs_tell_more_than_single_trials_for_the_same_budget():
         details = CampaignDetails(num_scored=100, look_ahead=look_ahead)
         sizes = {"num_samples": 64, "details": details}
         options = evolve(OPTIONS, stop=StopRules(budget=6.0), **sizes)
-        model = SimulatorModel(measure, noise=GaussianNoise(1.0))
+        model = SimulatorModel(measure, noise=1.0)
         c = Campaign(model, prior_of(5), MEASURED, cost=trip, options=options)
         c.run(lambda action: measure(TRUTH, action[None])[0], num_rounds=20)
         assert c.state.spent <= 6.0

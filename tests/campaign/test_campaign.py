@@ -10,18 +10,12 @@ from attrs import evolve
 from sbi.utils import BoxUniform
 from torch.distributions import MultivariateNormal
 
-from sbi_active import (
-    Campaign,
-    CampaignOptions,
-    DiscreteActions,
-    GaussianNoise,
-    SimulatorModel,
-    StopRules,
-)
-from sbi_active.actions import SignalActions
+from sbi_active.actions import DiscreteActions, SignalActions
 from sbi_active.actions.waveforms import step
+from sbi_active.campaign import Campaign, CampaignOptions, StopRules
 from sbi_active.campaign.options import CampaignDetails
 from sbi_active.messages import RenamedWarning
+from sbi_active.simulation import SimulatorModel
 from tests.campaign.problem import ACTIONS, OPTIONS, PRIOR, campaign, draws, noisy
 
 
@@ -62,7 +56,7 @@ def run(mode):
     """Return actions, scores and draws of a campaign, all of it made in a mode."""
     with mode():
         prior = BoxUniform(torch.zeros(1), torch.ones(1))
-        model = SimulatorModel(lambda t, a: t * a, noise=GaussianNoise(0.1))
+        model = SimulatorModel(lambda t, a: t * a, noise=0.1)
         actions = DiscreteActions(torch.tensor([0.5, 1.0, 3.0]))
         options = evolve(OPTIONS, network="each round")
         c = Campaign(model, prior, actions, method="asbi", options=options)
@@ -173,7 +167,7 @@ def test_every_parameter_must_be_known_to_stop(max_sd, stops):
 @pytest.mark.parametrize("scale", [1e-30, 1e20])
 def test_narrow_and_wide_priors_that_float32_holds(scale):
     prior = BoxUniform(torch.zeros(1), scale * torch.ones(1))
-    model = SimulatorModel(lambda t, a: t / scale * a, noise=GaussianNoise(0.1))
+    model = SimulatorModel(lambda t, a: t / scale * a, noise=0.1)
     c = Campaign(model, prior, ACTIONS, method="nsbi", options=OPTIONS)
     c.tell(1.8, action=[3.0])
     assert float(c.update().mean) / scale == pytest.approx(0.6, abs=0.05)
@@ -216,7 +210,7 @@ def test_signals_are_asked_for_and_learned_from():
     def follow(theta, action, *, inputs):
         return theta[:, :1] * inputs["voltage"] + theta[:, 1:]
 
-    model = SimulatorModel(follow, noise=GaussianNoise(0.02), inputs=space)
+    model = SimulatorModel(follow, noise=0.02, inputs=space)
     prior = BoxUniform(torch.tensor([1.0, -1.0]), torch.tensor([5.0, 1.0]))
     truth = torch.tensor([[3.0, 0.2]])
     c = Campaign(model, prior, space, options=OPTIONS)
@@ -243,7 +237,7 @@ def force(theta, action):
 
 
 NAMES = ["friction", "mass"]
-FORCE = SimulatorModel(force, noise=GaussianNoise(0.01), parameter_names=NAMES)
+FORCE = SimulatorModel(force, noise=0.01, parameter_names=NAMES)
 
 
 def test_what_is_said_outlives_the_process(tmp_path):

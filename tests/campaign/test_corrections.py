@@ -11,13 +11,7 @@ import torch
 from sbi_active.campaign.options import CampaignDetails
 from sbi_active.seeding import row_normals
 from sbi_active.simulation import Workers
-from tests.campaign.problem import (
-    ACTIONS,
-    PRIOR,
-    campaign,
-    draws,
-    noisy,
-)
+from tests.campaign.problem import ACTIONS, PRIOR, campaign, draws, noisy
 from tests.effects import BIAS
 
 TOLD = [(1.0, 0.62), (3.0, 1.75), (0.5, 0.33)]  # action, x at theta = .6
@@ -175,18 +169,19 @@ def test_a_correction_behind_an_adoption():
     assert scores(right)[-1] == scores(wrong)[-1]
 
 
-@pytest.mark.parametrize(
-    ("told", "text"),
-    [
-        ({"x": "abc"}, "expected x of real numbers; got 'abc'"),
-        ({"x": np.array([1e39])}, "expected x within +-3.4e38, the range of float32"),
-        ({"x": 1.0, "action": [np.nan]}, "expected a finite action"),
-        ({"x": 1.0, "action": [1.0, 2.0]}, "expected action of shape"),
-        ({"x": 1.0, "status": "lost"}, "expected status 'ok', 'invalid' or"),
-        ({"x": [1.0, 2.0]}, "expected x of shape (1,)"),
-        ({}, "expected the outcome x; got None"),
-    ],
-)
+#: What cannot be told, and what is said of it.
+UNTELLABLE = [
+    ({"x": "abc"}, "expected x of real numbers; got 'abc'"),
+    ({"x": np.array([1e39])}, "expected x within +-3.4e38, the range of float32"),
+    ({"x": 1.0, "action": [np.nan]}, "expected a finite action"),
+    ({"x": 1.0, "action": [1.0, 2.0]}, "expected action of shape"),
+    ({"x": 1.0, "status": "lost"}, "expected status 'ok', 'invalid' or"),
+    ({"x": [1.0, 2.0]}, "expected x of shape (1,)"),
+    ({}, "expected the outcome x; got None"),
+]
+
+
+@pytest.mark.parametrize(("told", "text"), UNTELLABLE)
 def test_what_is_refused_leaves_no_trace(told, text):
     c = campaign()
     c.ask()

@@ -5,16 +5,10 @@ import torch
 from sbi.utils import BoxUniform
 from sklearn.decomposition import PCA
 
-from sbi_active import (
-    Campaign,
-    CampaignOptions,
-    DiscreteActions,
-    GaussianNoise,
-    MixedActions,
-    RefinementOptions,
-    SimulatorModel,
-)
-from sbi_active.actions import SummaryAction
+from sbi_active.actions import DiscreteActions, MixedActions, SummaryAction
+from sbi_active.campaign import Campaign, CampaignOptions
+from sbi_active.inference import RefinementOptions
+from sbi_active.simulation import SimulatorModel
 from sbi_active.simulation.workers.store import SimulationBudgetError
 from sbi_active.tasks import get_task
 from tests.effects import BIAS
@@ -90,9 +84,9 @@ class Counted:
 
 def test_no_simulation_beyond_the_budget():
     fn = Counted()
-    model = SimulatorModel(fn, noise=GaussianNoise(0.05))
+    model = SimulatorModel(fn, noise=0.05)
     options = CampaignOptions(max_simulations=160, planned_trials=2, refinement=FEW)
-    c = Campaign(model, PRIOR, DiscreteActions([0.5, 1.0]), options=options)
+    c = Campaign(model, PRIOR, [0.5, 1.0], options=options)
     truth = torch.tensor([[0.6, 0.3]])
     for _ in range(3):
         if c.stop_reason:
@@ -117,7 +111,7 @@ def test_no_simulation_beyond_the_budget():
 
 def test_an_effect_is_adopted_within_the_budget():
     """A pool learns the augmented simulator, and never the prior's 2,000 rows."""
-    model = SimulatorModel(lambda t, a: t[:, :1] * a, noise=GaussianNoise(0.05))
+    model = SimulatorModel(lambda t, a: t[:, :1] * a, noise=0.05)
     prior = BoxUniform(torch.zeros(1), torch.ones(1))
     options = {"max_simulations": 600, "planned_trials": 4, "refinement": FEW}
     actions = DiscreteActions([-2.0, -1.0, 1.0, 2.0])
@@ -132,6 +126,37 @@ def test_an_effect_is_adopted_within_the_budget():
     assert all(t.outlyingness is None for t in c.history if t.surprise is None)
     mean = belief.sample((1_000,)).mean(0)
     assert torch.allclose(mean, torch.tensor([0.5, 0.8]), atol=0.15)
+
+
+def test_what_trials_may_take_adds_up_to_the_budget():
+    options = {"max_simulations": 240, "planned_trials": 2, "refinement": FEW}
+    c = Campaign(Blobs(), PRIOR, DiscreteActions([[0.2, 0.0]]), options=options)
+    may_take, meter = c._learner._rows_left, c.state.meter
+    for index in range(2):
+        taken = may_take("design", index)
+        assert 0.1 * meter.left < taken < 0.5 * meter.left
+        meter.spent += taken
+        meter.spent += may_take("belief", index)
+        c.attach([0.2, 0.0], torch.zeros(SIZE * SIZE))
+        c.state.processed.append(index)
+    assert 0 <= meter.left <= 2
+    meter.spent = 140
+    taken = may_take("design", 2)
+    meter.spent += taken
+    assert taken + may_take("belief", 2) == 50  # of an unplanned one, half of the rest
+
+
+def test_without_a_budget_a_trial_takes_a_round_s_simulations():
+    """What its design took, its belief does not take again."""
+    summaries = SummaryAction({"place": place, "nothing": nothing})
+    actions = MixedActions(DiscreteActions([0.2, 2.0], names=["force"]), summaries)
+    options = {"num_simulations": 200, "refinement": FEW}
+    c = Campaign(Blobs(), PRIOR, actions, seed=1, options=options)
+    action = c.ask().action
+    assert 0 < c.state.trials[0].num_simulations <= 100
+    c.tell(Blobs()(torch.tensor([[0.7, 0.2]]), action[None])[0])
+    c.update()
+    assert 100 < c.history[0].num_simulations <= 200
 
 
 # The posterior of all trials from a pool of few simulations
@@ -179,7 +204,7 @@ def test_rows_lost_to_faults_are_counted_once():
 
     model = SimulatorModel(fails, batched=False)
     options = {"max_simulations": 250, "planned_trials": 2, "refinement": FEW}
-    c = Campaign(model, PRIOR, DiscreteActions([0.5, 1.0]), options=options)
+    c = Campaign(model, PRIOR, [0.5, 1.0], options=options)
     c.run(lambda action: torch.tensor([0.6 * float(action[0]), 0.3]), num_rounds=2)
     c.update()
     assert 20 < len(lost) == sum(t.num_missing for t in c.history)

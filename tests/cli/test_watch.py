@@ -19,8 +19,7 @@ from sbi_active import Campaign
 from sbi_active.campaign.watch import server_of
 from sbi_active.cli import main
 from tests.cli.sled import forked
-from tests.display.browser import assert_reads_well
-from tests.display.driver import browser
+from tests.display.browser import assert_reads_well, browser
 from tests.simulation.bank.filled import execute
 
 ROOT = Path(__file__).parents[2]

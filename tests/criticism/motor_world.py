@@ -4,9 +4,9 @@ import torch
 from sbi.utils import BoxUniform
 from torch.distributions import HalfNormal
 
-from sbi_active import GaussianNoise, SimulatorModel
+from sbi_active import SimulatorModel
 from sbi_active.criticism import AugmentedSimulator, Context, Effect, Trials
-from tests.effects import effect, half, normal, on_outcomes
+from tests.effects import effect, half, normal
 
 NOISE = 0.05  # rad/s
 STEP = 0.02  # s
@@ -34,9 +34,7 @@ def speed(theta, action, *, inputs, times, input_times, start, coulomb=0.0):
     return (1 - part) * series.gather(1, low) + part * series.gather(1, low + 1)
 
 
-MODEL = SimulatorModel(
-    speed, noise=GaussianNoise(NOISE), parameter_names=["gain", "tau"]
-)
+MODEL = SimulatorModel(speed, noise=NOISE, parameter_names=["gain", "tau"])
 
 
 def _voltage(change):
@@ -54,7 +52,7 @@ DEAD_ZONE = effect(
 )
 SHIFTED = _voltage(lambda u, phi: u + phi)
 OFFSET = effect("voltage offset", hook="input", prior=normal(0.2), apply=SHIFTED)
-BIAS = on_outcomes("bias", lambda x, phi, action, context: x + phi, sd=0.3)
+BIAS = effect(prior=normal(0.3))
 COULOMB = Effect.keyword("coulomb", prior=HalfNormal(0.5))
 LIBRARY = [DEAD_ZONE, OFFSET, BIAS, COULOMB]
 

@@ -5,12 +5,7 @@ import pytest
 import torch
 from sbi.utils import BoxUniform
 
-from sbi_active import (
-    AutocorrelatedNoise,
-    DiscreteActions,
-    GaussianNoise,
-    SimulatorModel,
-)
+from sbi_active.actions import DiscreteActions
 from sbi_active.criticism import (
     AugmentedSimulator,
     Criticism,
@@ -18,10 +13,13 @@ from sbi_active.criticism import (
     close_loop,
     generic_effects,
 )
+from sbi_active.criticism.data.measurements import Measurements
+from sbi_active.criticism.linear.screening import Sampling, suggested_sampling, thinned
 from sbi_active.criticism.report.sections import figures
 from sbi_active.criticism.rivals.trial_simulator import TrialSimulator
+from sbi_active.simulation import AutocorrelatedNoise, GaussianNoise, SimulatorModel
 from tests.criticism.motor_world import LIBRARY, MODEL, PRIOR, measured
-from tests.effects import on_outcomes
+from tests.effects import autocorrelated, effect, normal
 
 
 def test_what_a_motor_lacks_is_found_proposed_and_simulated_on():
@@ -51,7 +49,7 @@ def test_equal_actions_with_other_inputs_are_simulated_apart():
     def summed(theta, action, *, inputs):
         return theta * inputs["u"].sum(1, keepdim=True) + action
 
-    model = SimulatorModel(summed, noise=GaussianNoise(0.1))
+    model = SimulatorModel(summed, noise=0.1)
     inputs = {"u": torch.tensor([[1.0, 2.0], [3.0, 4.0], [1.0, 2.0]])}
     given = {"inputs": inputs, "input_times": [0.0, 1.0]}
     trials = Trials(torch.zeros(3), torch.zeros(3), **given)
@@ -66,7 +64,7 @@ def test_a_function_of_one_row_gets_its_own_inputs():
         shapes.append((inputs["u"].shape, times.shape, input_times.shape, start.shape))
         return theta * inputs["u"].sum() + start[0]
 
-    model = SimulatorModel(one, noise=GaussianNoise(0.1), batched=False)
+    model = SimulatorModel(one, noise=0.1, batched=False)
     trials = Trials(
         None,
         torch.zeros(2, 1),
@@ -89,24 +87,64 @@ def falling(theta, action, *, times):  # which cannot do without them
 def test_a_simulator_may_require_times(by_model):
     times = torch.linspace(0.1, 1.0, 8)
     noise = GaussianNoise(0.02)
-    model = SimulatorModel(
-        falling, noise=noise, sample_times=times if by_model else None
-    )
+    own = times if by_model else None
+    model = SimulatorModel(falling, noise=noise, sample_times=own)
     prior = BoxUniform(torch.tensor([5.0]), torch.tensor([15.0]))
     action = torch.linspace(1, 3, 6)[:, None]
     gen = torch.Generator().manual_seed(0)
     x = falling(torch.tensor([[9.81]]), action, times=times) + 0.3
     x = x + 0.02 * torch.randn(x.shape, generator=gen)
     trials = Trials(action, x, sample_times=times)
-    bias = on_outcomes("bias", lambda x, phi, action, context: x + phi, sd=0.5)
-    effects = [bias]
+    effects = [effect(prior=normal(0.5))]
     if by_model:
         generic = generic_effects(model, DiscreteActions(action), prior=prior)
         effects += [e for e in generic if e.name not in ("bias", "action offset")]
-    report = close_loop(
-        model, prior, trials, effects=effects, evaluate=False, plan=False
-    )
+    given = {"effects": effects, "evaluate": False, "plan": False}
+    report = close_loop(model, prior, trials, **given)
     assert report.verdict == "bias"
+
+
+# Generic effects of recordings: which there are, and that a loop finds them
+
+
+@pytest.mark.parametrize(("name", "size"), [("input delay", 0.07), ("backlash", 0.5)])
+def test_what_an_actuator_does_is_found(name, size):
+    given = {"num": 5, "held_out": 0}
+    rivals = {"input gain", "input lag", "input delay", "backlash"}
+    effects = generic_effects(MODEL, measured(0, {}, **given), prior=PRIOR)
+    effects = [own for own in effects if own.name in rivals]
+    trials = measured(0, {name: size}, **given, library=effects)
+    tracing = Criticism(MODEL, PRIOR, trials, effects=effects).trace()
+    named = {part for g in tracing.equivalent if name in g for part in g}
+    assert tracing.verdict in {name} | named
+    for other in ("input lag", name):
+        assert not any({"none", other} <= group for group in tracing.equivalent)
+
+
+def two_sensors(theta, action, *, inputs, times):
+    """An angle and its rate, which follow the input at once."""
+    u = inputs["u"]
+    x = torch.stack([theta * u, 10 * theta * u.diff(dim=1, prepend=u[:, :1])], -1)
+    return x[:, : times.shape[1]]
+
+
+def test_sensors_have_effects_each_for_itself():
+    prior = BoxUniform(torch.ones(1), 3 * torch.ones(1))
+    model = SimulatorModel(two_sensors, noise=[0.05, 0.2])
+    gen = torch.Generator().manual_seed(0)
+    u = torch.randn(6, 20, generator=gen).double().cumsum(1)
+    times, truth = torch.arange(20).double(), torch.tensor([[2.0]]).double()
+    x = two_sensors(truth, None, inputs={"u": u}, times=times[None])
+    x = x + torch.tensor([0.05, 0.2]) * torch.randn(x.shape, generator=gen)
+    x[..., 1] += 0.6
+    given = {"sample_times": times, "inputs": {"u": u}}
+    trials = Trials(None, x, channel_labels=["angle [rad]", "rate [rad/s]"], **given)
+    effects = {e.name: e for e in generic_effects(model, trials, prior=prior)}
+    assert "bias" not in effects
+    sd = [effects[f"{n} bias"].declared_draws().std() for n in ("angle", "rate")]
+    assert 3 < float(sd[1] / sd[0]) < 5
+    some = [e for n, e in effects.items() if n.endswith(("bias", "sensor lag"))]
+    assert Criticism(model, prior, trials, effects=some).trace().verdict == "rate bias"
 
 
 # Trajectories that are sampled too densely for what the simulator gets wrong
@@ -116,11 +154,10 @@ SENSOR = 0.002
 TIMES = torch.arange(1, 241) * 0.02
 SWINGS = BoxUniform(0.2 * torch.ones(1), 2 * torch.ones(1))
 ACTIONS = DiscreteActions(torch.linspace(0.5, 2.0, 6))
-BIAS = on_outcomes("bias", lambda x, phi, action, context: x + phi, sd=0.1)
+BIAS = effect(prior=normal(0.1))
 
 
 def swing(theta, action):
-
     return theta * action * (1.3 * TIMES).sin()
 
 
@@ -171,3 +208,101 @@ def test_nobody_looks_where_it_is_not_asked_for_or_no_sensor_is_declared(options
 
 def test_what_the_sensor_alone_gets_wrong_is_kept():
     assert loop(0.0).sampling.every == 1
+
+
+# The rate from which samples say nothing of their own, from known processes
+
+
+STEP = 0.02
+
+
+def trials_of(x, step=STEP):
+    times = step * torch.arange(1, x.shape[1] + 1).double()
+    return Trials(torch.arange(len(x)).double(), x, sample_times=times)
+
+
+def suggested(trials, x, times=None):
+    m = Measurements.of(trials, times)
+    return suggested_sampling(m, np.asarray(x).reshape(-1)[m.position])
+
+
+def smooth(num, length, width, rng):
+    """Return a process that is correlated as a Gaussian of a width in samples."""
+    at = np.arange(-4 * width, 4 * width + 1)
+    kernel = np.exp(-((at / width) ** 2))
+    kernel /= np.sqrt((kernel**2).sum())
+    white = rng.normal(size=(num, length + len(at) - 1))
+    return np.stack([np.convolve(row, kernel, "valid") for row in white])
+
+
+@pytest.mark.parametrize("rho", [0.0, 0.5, 0.95])
+def test_errors_as_assumed_are_kept_all(rho):
+    x = autocorrelated(np.random.default_rng(0).normal(size=(8, 300)), rho)
+    found = suggested(trials_of(x), x)
+    assert found.every == 1
+    assert abs(found.before) < 0.1
+    assert found.suggested_step == pytest.approx(STEP)
+
+
+@pytest.mark.parametrize("width", [5, 10])
+@pytest.mark.parametrize("seed", [0, 1])
+def test_smooth_errors_are_thinned_to_about_their_width(width, seed):
+    x = smooth(8, 500, width, np.random.default_rng(seed))
+    found = suggested(trials_of(x), x)
+    assert 1.0 * width <= found.every <= 2.5 * width
+    assert found.before > 0.9
+    assert found.after <= 0.2
+    # Their correlation is exp(-d^2 / (2 width^2)): as far apart, less than .61.
+    other = suggested(trials_of(x, step=1.0), x)
+    assert other.every == found.every
+    assert other.suggested_step == pytest.approx(found.every)
+
+
+def test_the_sensor_s_error_on_top_counts_by_its_size():
+    rng = np.random.default_rng(0)
+    x = 0.3 * smooth(8, 300, 6, rng) + rng.normal(size=(8, 300))
+    assert suggested(trials_of(x), x).every == 1
+    x = smooth(8, 2_000, 40, rng) + 0.05 * rng.normal(size=(8, 2_000))
+    # From sample to sample the smooth one moves by .025, half of the sensor's error.
+    assert 40 <= suggested(trials_of(x), x).every <= 100
+
+
+def test_at_least_eight_samples_are_left():
+    x = np.sin(np.arange(40) / 30 + np.arange(6)[:, None])
+    assert suggested(trials_of(x), x).every <= 5
+    short = x[:, :7]
+    assert suggested(trials_of(short), short).every == 1
+
+
+def test_gaps_several_channels_and_ragged_trials():
+    rng = np.random.default_rng(2)
+    x = np.stack([smooth(6, 400, 5, rng), 1e3 * smooth(6, 400, 5, rng)], -1)
+    x[:, 350:] = np.nan
+    x[2, 100:120, 0] = np.nan
+    times = STEP * (1 + np.arange(400)) + 0.002 * rng.random((6, 400))
+    trials = Trials(torch.arange(6.0), x, sample_times=times)
+    assert 5 <= suggested(trials, x).every <= 13
+    by_model = Trials(torch.arange(6.0), x)
+    assert suggested(by_model, x, times).every <= 13
+
+
+def test_channels_of_other_rates_and_short_trials_keep_their_own():
+    x = torch.full((2, 12, 2), torch.nan)
+    x[0, :, 0] = 1.0
+    x[0, 1::4, 1] = 2.0  # a slow sensor, between the other's samples
+    x[1, :2] = 3.0  # a trial that ended early
+    trials = Trials([1.0, 2.0], x, sample_times=torch.arange(12.0))
+    few = thinned(trials, Sampling(step=1.0, every=3, before=0.9, after=0.1)).mask
+    assert few[0, :, 0].nonzero()[:, 0].tolist() == [2, 5, 8, 11]
+    assert few[0, :, 1].nonzero()[:, 0].tolist() == [5, 9]
+    assert few[1].nonzero()[:, 0].tolist() == [1, 1]
+
+
+def test_a_slow_channel_beside_a_fast_one_does_not_hide_it():
+    rng = np.random.default_rng(0)
+    x = np.full((6, 600, 2), np.nan)
+    x[:, :, 0] = smooth(6, 600, 10, rng)
+    x[:, 3::50, 1] = rng.normal(size=(6, 12))
+    assert 8 <= suggested(trials_of(x), x).every <= 25
+    x[:, 3::5, 1] = smooth(6, 600, 10, rng)[:, 3::5]
+    assert 4 <= suggested(trials_of(x), x).every <= 25

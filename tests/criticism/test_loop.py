@@ -5,7 +5,7 @@ import pytest
 import torch
 from sbi.utils import BoxUniform
 
-from sbi_active import DiscreteActions, GaussianNoise, SimulatorModel
+from sbi_active import DiscreteActions, SimulatorModel
 from sbi_active.criticism import (
     AugmentedSimulator,
     Criticism,
@@ -13,7 +13,7 @@ from sbi_active.criticism import (
     Trials,
     close_loop,
 )
-from tests.effects import BIAS, effect, normal, on_outcomes
+from tests.effects import BIAS, drift, effect, gain, normal
 
 PRIOR = BoxUniform(-3 * torch.ones(2), 3 * torch.ones(2))
 ACTIONS = DiscreteActions(torch.linspace(-2, 2, 17))
@@ -25,7 +25,7 @@ def response(theta, action, cubic=0.0):
     return (theta[:, 0] * xi + theta[:, 1] * xi**2 + cubic * xi**3)[:, None]
 
 
-MODEL = SimulatorModel(response, noise=GaussianNoise(NOISE), parameter_names=["a", "b"])
+MODEL = SimulatorModel(response, noise=NOISE, parameter_names=["a", "b"])
 
 
 @pytest.mark.parametrize(
@@ -48,10 +48,7 @@ def test_parts_of_another_class_are_refused(given, options, message):
 
 
 CUBIC = Effect.keyword("cubic", prior=normal(0.5))
-DRIFT = on_outcomes(
-    "drift", lambda x, phi, action, context: x + phi * context.index[:, None], sd=0.2
-)
-GAIN = on_outcomes("gain", lambda x, phi, action, context: x * (1 + phi), sd=0.3)
+DRIFT, GAIN = drift(0.2), gain(0.3)
 LIBRARY = [BIAS, CUBIC, DRIFT, GAIN]
 
 
@@ -98,7 +95,7 @@ def test_hidden_effects_are_named_and_measured(name):
 def test_drift_is_bias_and_slope_where_actions_run_in_order():
     action = torch.linspace(-2, 2, 9)
     line = SimulatorModel(
-        lambda theta, xi: theta[:, :1] + theta[:, 1:] * xi, noise=GaussianNoise(NOISE)
+        lambda theta, xi: theta[:, :1] + theta[:, 1:] * xi, noise=NOISE
     )
     trials = Trials(action, action)
     tracing = Criticism(line, PRIOR, trials, effects=[DRIFT], actions=ACTIONS).trace()
@@ -124,9 +121,8 @@ def test_nothing_is_added_to_a_right_model():
 
 def test_the_augmented_simulator_and_its_prior_go_on():
     trials = measured(1, {"bias": 0.8})
-    report = close_loop(
-        MODEL, PRIOR, trials, effects=LIBRARY, evaluate=False, plan=False
-    )
+    given = {"effects": LIBRARY, "evaluate": False, "plan": False}
+    report = close_loop(MODEL, PRIOR, trials, **given)
     z = report.prior.sample((7,))
     assert report.verdict == "bias"
     assert z.shape == (7, 3)
@@ -141,7 +137,7 @@ def test_trajectories_with_their_own_stamps_and_correlated_errors():
     def decay(theta, action):
         return action * torch.exp(-theta[:, :1] * times.to(theta))
 
-    model = SimulatorModel(decay, noise=GaussianNoise(0.05), sample_times=times)
+    model = SimulatorModel(decay, noise=0.05, sample_times=times)
     prior = BoxUniform(torch.tensor([0.2]), torch.tensor([3.0]))
     gen = torch.Generator().manual_seed(0)
     action = torch.tensor([1.0, -1.0, 2.0, -2.0, 1.5])
@@ -198,12 +194,10 @@ def both(theta, action):
     return torch.cat([response(theta, action), 10 * action], 1)
 
 
-TWO = SimulatorModel(
-    both, noise=GaussianNoise(NOISE), channel_names=["rail [m]", "swing"]
-)
+TWO = SimulatorModel(both, noise=NOISE, channel_names=["rail [m]", "swing"])
 TIMED = SimulatorModel(
     lambda theta, action: theta[:, :1] * torch.linspace(0, 1, 5).to(theta),
-    noise=GaussianNoise(NOISE),
+    noise=NOISE,
     sample_times=torch.linspace(0, 1, 5),
 )
 LABELS = ["swing [rad]", "rail [m]"]
@@ -219,20 +213,21 @@ BEYOND = Trials(ONES, MORE, sample_times=[0, 0.5, 1.5])
 NONE_FIT = Trials(ONES, LOST, role=["fit", "fit", "held out"])
 
 
-@pytest.mark.parametrize(
-    ("message", "changes"),
-    [
-        ("at least 3 repeats of one action", {"model": SimulatorModel(response)}),
-        ("noise would count twice", {"model": SimulatorModel(noisy, noise=NOISE)}),
-        ("at least two valid trials to fit; got 1", {"trials": measured(1, {}, num=1)}),
-        ("trials of the simulator's shape", {"trials": Trials(ONES, torch.ones(3, 4))}),
-        ("at least two valid trials to fit; got 0", {"trials": NONE_FIT}),
-        ("expected effects not named none", {"effects": [SCATTER]}),
-        ("actions of dimension 1", {"actions": DiscreteActions([[1.0, 2.0]])}),
-        ("rail, swing; got swing, rail", {"model": TWO, "trials": SWAPPED}),
-        ("those of the simulator, 0 to 1", {"model": TIMED, "trials": BEYOND}),
-    ],
-)
+#: What lacks, and what is said of it.
+INCOMPARABLE = [
+    ("at least 3 repeats of one action", {"model": SimulatorModel(response)}),
+    ("noise would count twice", {"model": SimulatorModel(noisy, noise=NOISE)}),
+    ("at least two valid trials to fit; got 1", {"trials": measured(1, {}, num=1)}),
+    ("trials of the simulator's shape", {"trials": Trials(ONES, torch.ones(3, 4))}),
+    ("at least two valid trials to fit; got 0", {"trials": NONE_FIT}),
+    ("expected effects not named none", {"effects": [SCATTER]}),
+    ("actions of dimension 1", {"actions": DiscreteActions([[1.0, 2.0]])}),
+    ("rail, swing; got swing, rail", {"model": TWO, "trials": SWAPPED}),
+    ("those of the simulator, 0 to 1", {"model": TIMED, "trials": BEYOND}),
+]
+
+
+@pytest.mark.parametrize(("message", "changes"), INCOMPARABLE)
 def test_what_cannot_be_compared(message, changes):
     given = {"model": MODEL, "trials": measured(1, {}), **changes}
     with pytest.raises(ValueError, match=message):

@@ -3,12 +3,12 @@
 import pytest
 import torch
 from sbi.utils import BoxUniform
-from torch.distributions import Independent, Normal
 
 from sbi_active import DiscreteActions, GaussianNoise, SimulatorModel, StudentTNoise
 from sbi_active.criticism import Criticism, Effect, Trials
 from sbi_active.criticism.steps.detection import credible_set
 from tests.criticism.misfit import oscillator
+from tests.effects import normal
 
 PRIOR = BoxUniform(-5 * torch.ones(2), 5 * torch.ones(2))
 ACTIONS = DiscreteActions(torch.arange(-5, 5.5, 0.5))
@@ -21,10 +21,8 @@ def response(theta, action, quadratic=0.0):
     return x[:, None]
 
 
-MODEL = SimulatorModel(response, noise=GaussianNoise(1.0))
-QUADRATIC = Effect.keyword(
-    "quadratic", prior=Independent(Normal(torch.zeros(1), torch.ones(1)), 1)
-)
+MODEL = SimulatorModel(response, noise=1.0)
+QUADRATIC = Effect.keyword("quadratic", prior=normal())
 
 
 def measured(xi=XI, *, quadratic=0.0, seed=0):

@@ -1,19 +1,126 @@
 """Outcomes without a measurement count: an exact discrete-continuous world.
 
+A push of strength a gives x = a theta + N(0, 1), or nothing with a probability that
+grows with the strength and depends on theta; its information is known by enumeration of
+validity and quadrature over theta and x.
+
 Every estimator is held to three of its standard errors of the exact value.
 """
 
-from dataclasses import replace
+import math
+import warnings
+from dataclasses import dataclass, replace
+from functools import cache
 
 import pytest
 import torch
+from torch import Tensor
+from torch.distributions import MultivariateNormal
 
 from sbi_active import ASBI, DiscreteActions, InformationGainDesigner, MixtureDensity
 from sbi_active.design import EntropyGain, NestedGain, PosteriorGain
 from sbi_active.design.estimators.base import CandidateSimulations, standard_error
 from sbi_active.design.estimators.posterior import ParameterGain
-from sbi_active.simulation import SimulatorModel
-from tests.design.fragile import ACTIONS, NOISE, PRIOR, Fragile
+from sbi_active.seeding import row_normals
+from sbi_active.simulation import GaussianNoise, MissingRowsWarning, SimulatorModel
+from tests import linear_gaussian
+from tests.design import test_designer as pushes
+
+PRIOR = MultivariateNormal(torch.zeros(1), torch.eye(1))
+ACTIONS = torch.tensor([[0.5], [1.0], [2.0], [8.0]])
+GRID = -5.985 + 0.03 * torch.arange(400).double()  # no point at an edge of validity
+WEIGHT = torch.softmax(-0.5 * GRID**2, 0)  # of the prior on the grid
+NOISE = GaussianNoise(1.0)
+
+
+@dataclass(frozen=True)
+class Fragile:
+    """Pushes that fail.
+
+    Attributes:
+        luck: 0 for validity that is a function of theta; the width of the logistic
+            otherwise.
+    """
+
+    luck: float
+
+    def log_valid(self, theta: Tensor, action: Tensor) -> Tensor:
+        """Log probability of a measurement; strong pushes need a large theta."""
+        margin = theta - 0.3 * (action - 2)
+        if self.luck == 0:
+            return torch.where(margin > 0, 0.0, -torch.inf).to(theta)
+        return torch.nn.functional.logsigmoid(margin / self.luck)
+
+    def mean(self, theta: Tensor, action: Tensor) -> Tensor:
+        """Noise-free outcome, NaN where there is none."""
+        lost = torch.rand_like(theta).log() > self.log_valid(theta, action)
+        return torch.where(lost, torch.nan, action * theta)
+
+    def __call__(self, theta: Tensor, action: Tensor) -> Tensor:
+        """Return outcomes, shape (n, 1)."""
+        mean = self.mean(theta, action)
+        return mean + torch.randn_like(mean)
+
+    def simulations(self, num_samples: int, seed: int) -> CandidateSimulations:
+        """Return declared simulations without luck, replicated ones with it."""
+        torch.manual_seed(seed)
+        theta = PRIOR.sample((num_samples,))
+        action = ACTIONS[:, None].expand(-1, num_samples, 1)
+        rows = theta.expand(action.shape), action
+        if self.luck == 0:
+            mean = self.mean(*rows)
+            x = mean + torch.randn_like(theta)
+            return CandidateSimulations(theta, ACTIONS, x, mean, NOISE)
+        return CandidateSimulations(theta, ACTIONS, self(*rows), replicate=self(*rows))
+
+    @cache  # noqa: B019, three worlds live as long as the tests
+    def exact(self) -> dict[str, Tensor]:
+        """Return exact gains in nats, each of shape (a,).
+
+        "counted" is the information of all outcomes; "validity" that of validity alone;
+        "dropped" the mean of log p(theta | x) - log p(theta) over measurements, which
+        forgets the others.
+        """
+        result: dict[str, list[float]] = {"counted": [], "validity": [], "dropped": []}
+        x = torch.linspace(-50, 50, 2_501).double()
+        for a in ACTIONS[:, 0].double():
+            log_v = self.log_valid(GRID, a)
+            p = log_v.exp()
+            valid = (WEIGHT * p).sum()
+            known = torch.special.xlogy(p, p / valid)
+            known += torch.special.xlogy(1 - p, (1 - p) / (1 - valid))
+            validity = WEIGHT @ known
+            log_x = -0.5 * (x[:, None] - a * GRID) ** 2 - 0.5 * math.log(2 * math.pi)
+            # E over measurements of log p(x | theta) - log p(x | valid)
+            joint = WEIGHT * p / valid
+            density = log_x.exp() @ joint
+            entropy = -torch.special.xlogy(density, density).sum() * (x[1] - x[0])
+            conditional = entropy - 0.5 * (math.log(2 * math.pi) + 1)
+            tilt = joint @ torch.where(joint > 0, log_v - valid.log(), 0.0)
+            result["counted"].append(float(validity + valid * conditional))
+            result["validity"].append(float(validity))
+            result["dropped"].append(float(conditional + tilt))
+        return {name: torch.tensor(v).double() for name, v in result.items()}
+
+    def log_posterior(self, theta: Tensor, x: Tensor, action: Tensor) -> Tensor:
+        """Exact log density given a measurement or none, as a network's."""
+        theta, x, action = theta.double(), x.double(), action.double()
+
+        def log_joint(t: Tensor) -> Tensor:
+            log_v = self.log_valid(t, action)
+            lost = torch.log1p(-log_v.exp().clamp_max(1 - 1e-12))
+            measured = log_v + log_normal(x - action * t)
+            return torch.where(x.isnan(), lost, measured) + log_normal(t)
+
+        step = float(GRID[1] - GRID[0])
+        evidence = log_joint(GRID.expand(len(x), -1)).logsumexp(1) + math.log(step)
+        return log_joint(theta)[:, 0] - evidence
+
+
+def log_normal(z: Tensor) -> Tensor:
+    """Standard normal log density."""
+    return -0.5 * z**2 - 0.5 * math.log(2 * math.pi)
+
 
 CERTAIN, LUCKY, LUCKIER = Fragile(0.0), Fragile(0.4), Fragile(1.5)
 BY_LUCK = {
@@ -89,9 +196,8 @@ def test_dropping_invalid_rows_reverses_the_choice(world):
     gain = PosteriorGain()(world, rows, PRIOR)
     valid = rows.x[..., 0].isfinite()
     dropped = (gain * valid).sum(1) / valid.sum(1)
-    error = torch.stack(
-        [standard_error(g[v]) for g, v in zip(gain, valid, strict=True)]
-    )
+    pairs = zip(gain, valid, strict=True)
+    error = torch.stack([standard_error(g[v]) for g, v in pairs])
     assert ((dropped - exact["dropped"]).abs() < 4 * error).all()
     assert int(dropped.argmax()) == 3
     assert dropped[3] > dropped[2] + 1.0
@@ -109,9 +215,7 @@ def test_missing_rows_are_dropped_and_not_invalid():
             assert (distance < 4 * error).all()
             assert (distance > -slack - 4 * error).all()
         # negative control: counted as invalid they mislead
-        wrong = CandidateSimulations(
-            rows.theta, rows.action, rows.x, rows.mean, rows.noise, rows.replicate
-        )
+        wrong = replace(rows, missing=None)
         mean, error = estimate(world, PosteriorGain(), wrong)
         assert ((mean - world.exact()["counted"]).abs() > 6 * error).any()
 
@@ -136,3 +240,80 @@ def test_the_designer_tells_luck_from_a_function_of_the_parameters():
     share = torch.distributions.Normal(0.0, 1.0).cdf(-0.3 * (ACTIONS[:, 0] - 2))
     error = (share * (1 - share) / (certain.num_samples)).sqrt()
     assert ((certain.probability_valid - share).abs() < 4 * error).all()
+
+
+# Designs on simulators whose outcomes are invalid or missing
+
+
+def falls_off(theta, action):
+    """A measurement with a probability that falls with the push; some are partial."""
+    x = linear_gaussian.simulator(theta, action)
+    x[torch.rand(len(x)) < 0.5, 1] = torch.nan  # partly observed: a measurement
+    lost = torch.rand(len(x), 1) < 0.3 * action
+    return x.masked_fill(lost, torch.nan)
+
+
+def test_a_measurement_that_is_too_improbable_excludes_an_action():
+    sizes = {"num_samples": 2_000, "estimator": "posterior"}
+    designer = InformationGainDesigner(pushes.ACTIONS, **sizes)
+
+    class Model(linear_gaussian.ExactModel):
+        def log_posterior(self, theta, x, action):
+            known = x.isfinite()
+            log_q = super().log_posterior(theta, x.nan_to_num(), action)
+            return torch.where(known.all(1), log_q, self.belief.log_prob(theta))
+
+    free = designer.select(Model(), falls_off, seed=0)
+    exact = 1 - 0.3 * pushes.VALUES
+    error = (exact * (1 - exact) / free.num_samples).sqrt()
+    assert ((free.probability_valid - exact).abs() <= 4 * error).all()
+    safe = designer.select(Model(), falls_off, min_probability_valid=0.6, seed=0)
+    assert free.action.tolist() == [2.0]  # negative control
+    assert safe.action.tolist() == [1.0]
+    assert safe.probability_best[3] == 0
+    assert safe.probability_best.sum() == pytest.approx(1.0)
+    assert safe.expected_information_gain.isfinite().all()
+    (note,) = safe.notes
+    assert note.startswith("1 of 4 candidates excluded: a measurement is less probable")
+    only_hard = InformationGainDesigner([1.5, 2.0], **sizes)
+    with pytest.raises(ValueError, match=r"at least 0.9; got 0\.5\d* at most"):
+        only_hard.select(Model(), falls_off, min_probability_valid=0.9, seed=0)
+
+
+def test_missing_rows_are_counted_and_warned_of_once():
+    def raises(theta, action, seeds):
+        if bool((seeds % 25 == 0).any()):
+            raise RuntimeError("licence server")
+        return theta * action + row_normals(seeds, 1)
+
+    actions = DiscreteActions([0.1, 4.0])
+    designer = InformationGainDesigner(actions, num_samples=400)
+    with pytest.warns(MissingRowsWarning, match="of the design are miss") as caught:
+        design = designer.select(None, raises, belief=PRIOR, seed=0)
+    assert len([w for w in caught if w.category is MissingRowsWarning]) == 1
+    error = (0.04 / design.num_simulations) ** 0.5
+    assert abs(design.num_missing / design.num_simulations - 0.04) < 3 * error
+
+
+@pytest.mark.parametrize("declared", [True, False])
+def test_a_rare_fault_stops_no_design(declared):
+    """Rows were lost in one draw and not in the next, or all that were run again."""
+
+    def fails(theta, action):
+        if bool((theta > 2.5).any()):
+            raise RuntimeError("diverged")
+        return theta * action
+
+    def noisy(theta, action):
+        return fails(theta, action) + torch.randn_like(theta)
+
+    model = SimulatorModel(fails, noise=1.0) if declared else noisy
+    designer = InformationGainDesigner([1.0, 1.1], num_samples=400)
+    lost = []
+    for seed in range(3):
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", MissingRowsWarning)
+            design = designer.select(None, model, belief=PRIOR, seed=seed)
+        assert design.probability_valid.tolist() == [1.0, 1.0]
+        lost.append(design.num_missing)
+    assert 0 < max(lost) < 60

@@ -7,14 +7,7 @@ import torch
 from sbi.utils import BoxUniform
 from torch.distributions import MultivariateNormal
 
-from sbi_active import (
-    ASBI,
-    BoxActions,
-    DiscreteActions,
-    GaussianNoise,
-    MixtureDensity,
-    SimulatorModel,
-)
+from sbi_active import ASBI, BoxActions, DiscreteActions, MixtureDensity, SimulatorModel
 from sbi_active.diagnostics import check_belief, check_calibration
 from sbi_active.inference import ActionPosterior
 from sbi_active.seeding import forked_generators
@@ -22,7 +15,7 @@ from sbi_active.seeding import forked_generators
 matplotlib.use("Agg")
 PRIOR = BoxUniform(-torch.ones(1), torch.ones(1))
 ACTIONS = DiscreteActions([0.5, 1.0, 2.0], names=["gain"])
-MODEL = SimulatorModel(lambda theta, action: theta * action, noise=GaussianNoise(0.2))
+MODEL = SimulatorModel(lambda theta, action: theta * action, noise=0.2)
 
 
 class Exact:
@@ -117,16 +110,17 @@ def gaussian(action, x, factor=1.0):
     return MultivariateNormal(mean.reshape(1), factor**2 / precision.reshape(1, 1))
 
 
-@pytest.mark.parametrize(
-    ("own", "every", "verdicts"),
-    [
-        (1.0, 1.0, ("trust",)),
-        (2.0, 1.0, ("refine",)),
-        (0.5, 1.0, ("stop", "refine")),
-        (2.0, 2.0, ("refine",)),
-        (0.5, 0.5, ("stop",)),
-    ],
-)
+#: Factors of the belief and of all beliefs, and verdicts.
+WIDTHS = [
+    (1.0, 1.0, ("trust",)),
+    (2.0, 1.0, ("refine",)),
+    (0.5, 1.0, ("stop", "refine")),
+    (2.0, 2.0, ("refine",)),
+    (0.5, 0.5, ("stop",)),
+]
+
+
+@pytest.mark.parametrize(("own", "every", "verdicts"), WIDTHS)
 def test_a_belief_too_wide_or_narrow_is_flagged(own, every, verdicts):
     action = torch.tensor([[1.0], [2.0]])
     x = torch.tensor([[0.4], [0.9]])
@@ -148,7 +142,7 @@ def test_a_continuum_of_actions_and_invalid_rows(trained):
         x = theta * action
         return torch.where(action > 1.8, torch.nan, x)
 
-    model = SimulatorModel(fails, noise=GaussianNoise(0.2))
+    model = SimulatorModel(fails, noise=0.2)
     posterior = with_network(trained, Exact())
     sizes = {"num_simulations": 400, "max_strata": 3}
     found = check_calibration(posterior, model, actions=space, **sizes)

@@ -2,22 +2,23 @@
 
 import re
 
-import matplotlib.pyplot
+import matplotlib.pyplot as plt
+import numpy as np
 import pandas as pd
 import pytest
 import torch
 from attrs import evolve
 from sbi.utils import BoxUniform
 
-from sbi_active import Campaign, DiscreteActions, GaussianNoise, SimulatorModel
+from sbi_active import BoxActions, Campaign, DiscreteActions, SimulatorModel
+from sbi_active.design.design import Design
 from sbi_active.display import Page, Section, Table
 from sbi_active.display.campaign_page import page as campaign_page
 from sbi_active.display.figures import legible
 from sbi_active.display.notebook import badge, card, facts, items, table
 from tests.campaign.storage.campaigns import MODEL, OPTIONS, PRIOR, go_on, new, outcome
 from tests.criticism.report.reports import report
-from tests.display.browser import CHROMIUM, assert_reads_well, look
-from tests.display.parsed import Parsed
+from tests.display.browser import CHROMIUM, Parsed, assert_reads_well, look
 
 TABLE = Table(("model", "P"), [("bare", 0.25), ("drag|lift", "0.7")])
 
@@ -51,13 +52,21 @@ def test_parameters_have_mean_deviation_and_interval():
 # Names that a user chose: money, control marks and halves of pairs
 
 
-matplotlib.use("Agg")
+plt.switch_backend("Agg")
+
+
+@pytest.fixture(autouse=True)
+def _closed():
+    yield
+    plt.close("all")
+
+
 NAMES = ["cost [$] \x07", "half \ud800", "a$b$c\\frac{"]
 
 
 def test_any_name_can_be_drawn_and_read(tmp_path):
     named = {"parameter_names": NAMES, "channel_names": NAMES}
-    model = SimulatorModel(lambda t, a: t * a, noise=GaussianNoise(0.1), **named)
+    model = SimulatorModel(lambda t, a: t * a, noise=0.1, **named)
     prior = BoxUniform(torch.zeros(3), torch.ones(3))
     actions = DiscreteActions(torch.eye(3) + 1, names=NAMES, units=["$"] * 3)
     options = evolve(OPTIONS, network="on demand")
@@ -187,7 +196,7 @@ def test_a_campaign_reads_well_in_a_browser(tmp_path):
 
 
 def test_ticks_of_a_logarithm_are_numbers():
-    figure, (left, right) = matplotlib.pyplot.subplots(1, 2)
+    figure, (left, right) = plt.subplots(1, 2)
     left.set(yscale="log", ylim=(1e-3, 1e3))
     right.set_yscale("symlog", linthresh=2)
     right.set_ylim(-100, 100)
@@ -195,4 +204,39 @@ def test_ticks_of_a_logarithm_are_numbers():
     texts = [text.get_text() for ax in (left, right) for text in ax.get_yticklabels()]
     assert {"0.01", "1", "\N{MINUS SIGN}10"} <= {*texts}
     assert "$" not in "".join(texts)
-    matplotlib.pyplot.close(figure)
+
+
+# What the picture of a design draws, for each kind of action
+
+
+def design(actions):
+    rows = actions.sample((30,), seed=0)
+    gain = rows.double().square().sum(1)
+    error = [torch.full_like(gain, 0.05)] * 4
+    made = {"bound": "lower", "index": 4, "num_simulations": 30}
+    return Design(rows[4], rows, gain, *error, **made, labels=actions.entry_labels)
+
+
+PUSHES = BoxActions([0.0, -1.0], [2.0, 1.0], names=["speed", "tilt"], units=["m/s", ""])
+
+
+def test_two_entries_make_a_map_with_every_candidate_and_the_chosen_one():
+    made = design(PUSHES)
+    ax = made.plot()
+    (marks,) = [c for c in ax.collections if len(c.get_offsets()) > 1]
+    np.testing.assert_allclose(marks.get_offsets(), made.candidates)
+    np.testing.assert_allclose(marks.get_array(), made.expected_information_gain)
+    (chosen,) = [each for each in ax.lines if each.get_label() == "chosen"]
+    np.testing.assert_allclose(chosen.get_xydata()[0], made.action)
+    assert (ax.get_xlabel(), ax.get_ylabel()) == ("speed [m/s]", "tilt")
+    assert [a.get_ylabel() for a in ax.figure.axes][1:] == ["EIG (lower bound) [nats]"]
+
+
+def test_more_entries_make_candidates_in_order() -> None:
+    made = design(BoxActions([0.0] * 3, [1.0] * 3))
+    ax = made.plot()
+    gain = made.expected_information_gain.sort(descending=True).values
+    np.testing.assert_allclose(ax.lines[0].get_ydata(), gain)
+    (chosen,) = [each for each in ax.lines if each.get_label() == "chosen"]
+    place = int(chosen.get_xdata()[0])
+    assert float(gain[place]) == float(made.expected_information_gain[made.index])

@@ -12,16 +12,10 @@ from pathlib import Path
 import pytest
 import torch
 
+from sbi_active import messages
 from sbi_active.campaign.storage.codec import decode, encode
 from sbi_active.criticism import Trials
 from sbi_active.inference.beliefs.diagnostics import Diagnostics
-from sbi_active.messages import (
-    CATEGORIES,
-    Explained,
-    Message,
-    TrialWarning,
-    explanations,
-)
 
 ROOT = Path(__file__).parents[2]
 LIBRARY = ROOT / "sbi_active"
@@ -79,10 +73,10 @@ def test_codes_are_those_of_the_registry():
     said |= {text[:5] for text in doubts.texts().values()}
     cautions = LIBRARY / "criticism" / "report" / "cautions.jinja"
     said |= {*re.findall(r"SA\d{3}", cautions.read_text(encoding="utf-8"))}
-    assert said == {*explanations()}
+    assert said == {*messages.explanations()}
     headings = re.findall("^### .*", (LIBRARY / "messages.md").read_text(), re.M)
     assert len(headings) == len(said)
-    assert {code[:3] for code in said} == {*CATEGORIES}
+    assert {code[:3] for code in said} == {*messages.CATEGORIES}
 
 
 def test_there_is_one_door():
@@ -110,7 +104,7 @@ def test_warnings_as_python_shows_them():
     (note,) = noted
     assert str(note.message).endswith(" (SA201)")
     assert note.filename == __file__
-    assert isinstance(note.message, TrialWarning)
+    assert isinstance(note.message, messages.TrialWarning)
     assert note.message.code == "SA201"
     with warnings.catch_warnings(record=True) as noted:
         warnings.simplefilter("always")
@@ -139,7 +133,7 @@ def test_warnings_as_a_belief_keeps_them(through):
 
 @pytest.mark.parametrize("error", named(), ids=lambda c: c.__name__)
 def test_every_error_with_a_name_says_its_place(error):
-    assert issubclass(error, Explained)
-    said = Message(error.__new__(error, "expected ...; got ..."))
+    assert issubclass(error, messages.Explained)
+    said = messages.Message(error.__new__(error, "expected ...; got ..."))
     assert said.code == error.code
-    assert f"`{error.__name__}`" in explanations()[said.code][1]
+    assert f"`{error.__name__}`" in messages.explanations()[said.code][1]

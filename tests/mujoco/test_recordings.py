@@ -5,9 +5,9 @@ import pandas as pd
 import pytest
 import torch
 
-from benchmarks.robots.models import SPRING_MASS
-from sbi_active.mujoco import from_mjcf
-from tests.mujoco.machines import held_arm
+from benchmarks.robots.models import PENDULUM, SPRING_MASS
+from sbi_active.mujoco import from_mjcf, identify_robot
+from tests.mujoco.machines import held_arm, stepped
 
 
 def logs():
@@ -52,15 +52,16 @@ def test_logs_become_si_as_tables_do(tmp_path):
     assert converted.start["slide"].tolist() == pytest.approx([0.1, 0.1])
 
 
-@pytest.mark.parametrize(
-    ("names", "message"),
-    [
-        ({"position": "position [px]"}, r"'position' in m; got \[px\] in the rec"),
-        ({"position": "position [deg]"}, r"'position' in m; got \[deg\] in the rec"),
-        ({"time": "time [mm]"}, r"times in s, .* got mm"),
-        ({"start slide": "position [m]"}, "each quantity once; got position and"),
-    ],
-)
+#: Columns renamed, and what is said of them.
+NO_UNITS = [
+    ({"position": "position [px]"}, r"'position' in m; got \[px\] in the rec"),
+    ({"position": "position [deg]"}, r"'position' in m; got \[deg\] in the rec"),
+    ({"time": "time [mm]"}, r"times in s, .* got mm"),
+    ({"start slide": "position [m]"}, "each quantity once; got position and"),
+]
+
+
+@pytest.mark.parametrize(("names", "message"), NO_UNITS)
 def test_units_that_cannot_be_those_of_the_model_are_refused(names, message):
     with pytest.raises(ValueError, match=message):
         read([log.rename(columns=names) for log in logs()])
@@ -78,19 +79,17 @@ def test_a_log_has_a_column_each_for_a_sensor_and_an_input_of_one_name():
         from_mjcf(*arm, **given, recordings=[log])
 
 
-@pytest.mark.parametrize(
-    ("spoil", "message"),
-    [
-        (lambda log: log[:0], "samples in recording 1; got no rows"),
-        (lambda log: log.assign(push=6 * log["push"]), "its ctrlrange, -5 to 5"),
-        (lambda log: log.drop(columns="start slide"), "same columns .*start slide"),
-        (lambda log: log[::-1], "times that increase .* recording 1"),
-        (
-            lambda log: log.assign(time=1.7e9 + log["time"]),
-            "subtract the time at which",
-        ),
-    ],
-)
+#: What spoils a log, and what is said of it.
+NO_LOGS = [
+    (lambda log: log[:0], "samples in recording 1; got no rows"),
+    (lambda log: log.assign(push=6 * log["push"]), "its ctrlrange, -5 to 5"),
+    (lambda log: log.drop(columns="start slide"), "same columns .*start slide"),
+    (lambda log: log[::-1], "times that increase .* recording 1"),
+    (lambda log: log.assign(time=1.7e9 + log["time"]), "subtract the time at which"),
+]
+
+
+@pytest.mark.parametrize(("spoil", "message"), NO_LOGS)
 def test_logs_that_do_not_fit_are_said(spoil, message):
     one, other = logs()
     with pytest.raises(ValueError, match=message):
@@ -138,3 +137,41 @@ def test_angles_that_wrap_or_are_degrees_are_said():
     del log["angle"]
     with pytest.warns(UserWarning, match="range ends at 1.57.* rad: are these degrees"):
         read_logs(log, xml=limited)
+
+
+# A robot's parameters from logs of one that has dry friction besides
+
+
+TRUTH = 0.03
+
+
+def log(start, rng, friction):
+    text = PENDULUM.replace("0.03", f'{TRUTH}" frictionloss="{friction}')
+    angles = [start, *stepped(text, 200, qpos=start)[1:, 0]]
+    angles = np.array(angles) + 0.005 * rng.standard_normal(200)
+    time, begin = 0.01 * np.arange(200), np.full(100, start)
+    return {"time": time[::2], "encoder": angles[::2], "start hinge": begin}
+
+
+def robot(friction):
+    rng = np.random.default_rng(3)
+    logs = [log(start, rng, friction) for start in (0.6, -1.2, 1.5, -0.9)]
+    unknown = {"hinge.damping": (0.0, 0.3)}
+    return from_mjcf(PENDULUM, unknown, recordings=logs, noise=0.005)
+
+
+def test_undeclared_friction_is_beside_it():
+    for friction in (0.0, 0.05):
+        belief = identify_robot(robot(friction))
+        low, high = belief.interval()["hinge.damping"]
+        assert low < TRUTH < high
+        assert high - low < 0.03
+        share = belief.diagnostics.beside["hinge friction loss"]
+        assert share == pytest.approx(float(friction > 0), abs=0.2)
+
+
+def test_without_anything_beside_it_is_wide_and_says_so():
+    belief = identify_robot(robot(0.05), beside=())
+    low, high = belief.interval()["hinge.damping"]
+    assert low < TRUTH < high
+    assert "disagree about hinge.damping" in belief.diagnostics.warnings[0]

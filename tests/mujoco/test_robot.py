@@ -2,6 +2,7 @@
 
 import pickle
 
+import mujoco
 import numpy as np
 import pytest
 import torch
@@ -12,6 +13,7 @@ from sbi_active.actions.signals import SignalActions
 from sbi_active.actions.waveforms import step
 from sbi_active.criticism import Trials
 from sbi_active.mujoco import from_mjcf
+from sbi_active.mujoco.models.spec import Source
 from sbi_active.mujoco.robot import Robot
 from sbi_active.simulation import Outcome, simulate
 from tests.campaign.problem import REFINEMENT
@@ -66,13 +68,14 @@ def armature(spec, value):
     spec.joint("hinge").armature = value
 
 
-@pytest.mark.parametrize(
-    ("edit", "old", "new", "is_affine"),
-    [
-        (armature, 'damping="0.03"', 'damping="0.03" armature="{}"', True),
-        (length, "0 0 -.5", "0 0 -{}", False),
-    ],
-)
+#: Edits, the same in the text, and whether one is affine.
+EDITS = [
+    (armature, 'damping="0.03"', 'damping="0.03" armature="{}"', True),
+    (length, "0 0 -.5", "0 0 -{}", False),
+]
+
+
+@pytest.mark.parametrize(("edit", "old", "new", "is_affine"), EDITS)
 def test_what_only_the_spec_says_is_written_or_compiled(edit, old, new, is_affine):
     robot = pendulum(parameters={"value": (0.3, 0.7, edit)})
     theta = torch.tensor([[0.35], [0.62]], dtype=torch.float64)
@@ -112,9 +115,8 @@ def test_signals_drive_actuators():
         inputs=space.inputs(action),
         input_times=space.input_times,
     )
-    again = robot.simulator.mean(
-        theta, trials.action, inputs=trials.inputs, input_times=trials.input_times
-    )
+    played = {"inputs": trials.inputs, "input_times": trials.input_times}
+    again = robot.simulator.mean(theta, trials.action, **played)
     assert (again == x).all()
 
 
@@ -145,15 +147,16 @@ def test_a_state_that_diverges_is_invalid_and_counted():
     assert (few[0] == x[0]).all()
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"parameters": {"hinge.dampin": (0, 1)}}, "did you mean 'hinge.damping'"),
-        ({"parameters": {"bob.mass": (-1, 1)}}, "'bob.mass' from 0 on; got -1 to 1"),
-        ({"parameters": {"hinge.damping": 0.1}}, r"\(low, high\) of .*; got 0.1"),
-        ({"times": [1.7e9, 1.7e9 + 1]}, "subtract the time at which the trial starts"),
-    ],
-)
+#: What does not fit, and what is said of it.
+UNFIT = [
+    ({"parameters": {"hinge.dampin": (0, 1)}}, "did you mean 'hinge.damping'"),
+    ({"parameters": {"bob.mass": (-1, 1)}}, "'bob.mass' from 0 on; got -1 to 1"),
+    ({"parameters": {"hinge.damping": 0.1}}, r"\(low, high\) of .*; got 0.1"),
+    ({"times": [1.7e9, 1.7e9 + 1]}, "subtract the time at which the trial starts"),
+]
+
+
+@pytest.mark.parametrize(("change", "message"), UNFIT)
 def test_what_does_not_fit_is_said(change, message):
     with pytest.raises(ValueError, match=message):
         pendulum(**change)
@@ -172,3 +175,45 @@ def test_the_belief_of_a_campaign_is_kept(tmp_path):
         assert torch.equal(read.belief.mean, belief.mean)
     with Campaign.load(tmp_path / "c", simulator=pendulum().simulator) as loaded:
         assert torch.equal(loaded.belief.log_prob(truth), belief.log_prob(truth))
+
+
+# A model's source: the same model in every process
+
+
+CORNERS = [(x, y, z) for x in (0, 1) for y in (0, 1) for z in (0, 2)]
+BLOCK = """<mujoco><compiler meshdir="parts"/>
+<asset><mesh name="block" file="block.obj"/>
+<texture name="wood" type="2d" file="missing.png"/>
+<material name="wooden" texture="wood" rgba="1 0 0 1"/></asset>
+<worldbody><body><joint name="hinge" axis="0 1 0"/>
+<geom type="mesh" mesh="block" material="wooden"/></body></worldbody></mujoco>"""
+
+
+@pytest.fixture
+def path(tmp_path):
+    (tmp_path / "parts").mkdir()
+    lines = [f"v {x} {y} {z}" for x, y, z in CORNERS]
+    lines += ["f 1 2 4", "f 1 4 3", "f 5 8 6", "f 5 7 8", "f 1 5 6", "f 1 6 2"]
+    lines += ["f 3 4 8", "f 3 8 7", "f 1 3 7", "f 1 7 5", "f 2 6 8", "f 2 8 4"]
+    (tmp_path / "parts/block.obj").write_text("\n".join(lines))
+    (tmp_path / "block.xml").write_text(BLOCK)
+    return tmp_path / "block.xml"
+
+
+def from_elsewhere(path, monkeypatch):
+    monkeypatch.chdir(path.parent)
+    return mujoco.MjSpec.from_file("block.xml")
+
+
+def test_a_file_that_is_not_there(tmp_path):
+    with pytest.raises(ValueError, match=r"an MJCF file; got none at .*arm.xml; check"):
+        Source(tmp_path / "arm.xml")
+
+
+@pytest.mark.parametrize("is_spec", [False, True])
+def test_other_processes_find_meshes_beside_the_file(path, monkeypatch, is_spec):
+    source = Source(from_elsewhere(path, monkeypatch) if is_spec else path)
+    monkeypatch.chdir("/")
+    here, there = source.compile(), pickle.loads(pickle.dumps(source)).compile()
+    assert here.body_mass[1] == pytest.approx(2000.0, rel=1e-6)
+    np.testing.assert_array_equal(here.body_inertia, there.body_inertia)

@@ -118,9 +118,8 @@ def test_a_transform_acts_on_what_is_predicted():
     group = sequences()
     robot = from_sysid(group, params, transform=transform, noise=0.01)
     assert robot.simulator.channel_names == ["position"]
-    residual_fn = sysid.build_residual_fn(
-        models_sequences=[group], modify_residual=transform.apply
-    )
+    given = {"models_sequences": [group], "modify_residual": transform.apply}
+    residual_fn = sysid.build_residual_fn(**given)
     theta = np.array([1.2, 0.9, 0.017, 1.1, 0.03])
     found, _, measured = residual_fn(theta, params.copy())
     rows = torch.tensor(theta)[None].expand(2, -1)
@@ -153,9 +152,8 @@ def test_a_belief_comes_back_as_parameters(tmp_path):
 
 
 def test_randomization_keeps_what_parameters_have_in_common():
-    line = torch.distributions.MultivariateNormal(
-        torch.zeros(2), torch.tensor([[1.0, 0.9], [0.9, 1.0]])
-    )
+    covariance = torch.tensor([[1.0, 0.9], [0.9, 1.0]])
+    line = torch.distributions.MultivariateNormal(torch.zeros(2), covariance)
     found = randomization(line, [0.5, 0.95], names=["a", "b"], num_samples=4_000)
     low, high = found.ranges[0.95]["a"]
     assert (low, high) == (pytest.approx(-1.96, abs=0.1), pytest.approx(1.96, abs=0.1))

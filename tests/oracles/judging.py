@@ -6,8 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tests.oracles.noise import Array
-from tests.oracles.problem import Problem
+from tests.oracles.problem import Array, Problem
 from tests.oracles.reference import Answer
 
 #: Draws a parameter within a region, below which their moments say little.

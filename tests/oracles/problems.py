@@ -18,8 +18,7 @@ from sbi.utils import MultipleIndependent
 from torch.distributions import Bernoulli
 
 from sbi_active.tasks import get_task
-from tests.oracles.noise import Array, Normal, Student, Uniform
-from tests.oracles.problem import Problem, box, gauss
+from tests.oracles.problem import Array, Normal, Problem, Student, Uniform, box, gauss
 
 PROBLEMS: dict[str, Callable[[], Problem]] = {}
 

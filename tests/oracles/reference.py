@@ -18,8 +18,7 @@ from scipy.optimize import least_squares
 from scipy.special import gammaln, logsumexp
 from sklearn.mixture import GaussianMixture
 
-from tests.oracles.noise import Array
-from tests.oracles.problem import Problem
+from tests.oracles.problem import Array, Problem
 
 FILE = Path(__file__).with_name("answers.json")
 #: Degrees of freedom of the proposals.

@@ -16,21 +16,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from sbi_active import (
-    BoxActions,
-    Campaign,
-    CampaignOptions,
-    MixtureDensity,
-    RefinementOptions,
-    SimulatorModel,
-    simulate,
-)
+from sbi_active.actions import BoxActions
+from sbi_active.campaign import Campaign, CampaignOptions
 from sbi_active.campaign.options import CampaignDetails
 from sbi_active.criticism import Criticism, Trials, identify
-from sbi_active.inference import refine
+from sbi_active.inference import MixtureDensity, RefinementOptions, refine
+from sbi_active.simulation import SimulatorModel, simulate
 from tests.oracles.judging import Found
-from tests.oracles.noise import Normal, Student
-from tests.oracles.problem import Problem
+from tests.oracles.problem import Normal, Problem, Student
 from tests.oracles.reference import Students, Weighted, covariance, searched
 
 #: Draws of each belief.
@@ -153,18 +146,13 @@ WAYS["campaign"] = Way(
     declared,
 )
 WAYS["max_simulations=1000"] = Way(
-    in_campaign(max_simulations=1_000, planned_trials=4),
-    few_declared,
+    in_campaign(max_simulations=1_000, planned_trials=4), few_declared
 )
 # Networks alone: with refine=True every method gives the belief of "campaign".
 WAYS["asbi, chained"] = Way(
-    in_campaign(method="asbi", refine=False, **SMALL),
-    few_declared,
+    in_campaign(method="asbi", refine=False, **SMALL), few_declared
 )
-WAYS["alhi"] = Way(
-    in_campaign(method="alhi", refine=False, **SMALL),
-    few_declared,
-)
+WAYS["alhi"] = Way(in_campaign(method="alhi", refine=False, **SMALL), few_declared)
 WAYS["seqbed"] = Way(
     in_campaign(method="seqbed", refine=False, num_simulations=2_000),
     lambda own: scalar(own) and declared(own),

@@ -46,13 +46,14 @@ def mixed(theta, action, seeds):
     return theta * action + noise
 
 
-@pytest.mark.parametrize(
-    ("simulator", "seeds"),
-    [
-        (noisy, "seeds: no argument"),
-        (SimulatorModel(row, batched=False), "seeds: one a row"),
-    ],
-)
+#: Simulators, and what is said of their seeds.
+CLEAN = [
+    (noisy, "seeds: no argument"),
+    (SimulatorModel(row, batched=False), "seeds: one a row"),
+]
+
+
+@pytest.mark.parametrize(("simulator", "seeds"), CLEAN)
 def test_a_clean_simulator_is_ready(simulator, seeds):
     report = check(simulator)
     assert report.is_ready
@@ -62,46 +63,49 @@ def test_a_clean_simulator_is_ready(simulator, seeds):
     assert any(fact.startswith(seeds) for fact in report.facts)
 
 
-@pytest.mark.parametrize(
-    ("simulator", "expected"),
-    [
-        (lambda t, a: t * a, "got identical x from two seeds"),
-        (lambda t, a: noisy(t, a)[:1], "one row a parameter set, shape (16, ...); got"),
-        (raises, "RuntimeError: no model file"),
-        (flat, "of one shape; got (2,) a row from 16 rows and (1,) from one"),
-        (lambda t, a: torch.full_like(t, torch.nan), "no row has a measurement"),
-        (mixed, "x depends on which rows are simulated together"),
-        (lambda t, a: a + torch.randn_like(a), "no parameter changes x"),
-    ],
-)
+#: Simulators, and their defect.
+DEFECTS = [
+    (lambda t, a: t * a, "got identical x from two seeds"),
+    (lambda t, a: noisy(t, a)[:1], "one row a parameter set, shape (16, ...); got"),
+    (raises, "RuntimeError: no model file"),
+    (flat, "of one shape; got (2,) a row from 16 rows and (1,) from one"),
+    (lambda t, a: torch.full_like(t, torch.nan), "no row has a measurement"),
+    (mixed, "x depends on which rows are simulated together"),
+    (lambda t, a: a + torch.randn_like(a), "no parameter changes x"),
+]
+
+
+@pytest.mark.parametrize(("simulator", "expected"), DEFECTS)
 def test_defects_are_found(simulator, expected):
     report = check(simulator)
     assert str(report).endswith("\nnot ready")
     assert any(expected in defect for defect in report.defects)
 
 
-@pytest.mark.parametrize(
-    ("simulator", "expected"),
-    [
-        (lambda t, a: noisy(t, a)[:, :1], "changing theta_2 leaves x as it is"),
-        (SimulatorModel(noisy, noise=1.0), "fn is random beside declared noise, which"),
-        (SimulatorModel(some_raise, batched=False), "unstable contact; their outcome"),
-    ],
-)
+#: Simulators, and what is said of them.
+WARNED = [
+    (lambda t, a: noisy(t, a)[:, :1], "changing theta_2 leaves x as it is"),
+    (SimulatorModel(noisy, noise=1.0), "fn is random beside declared noise, which"),
+    (SimulatorModel(some_raise, batched=False), "unstable contact; their outcome"),
+]
+
+
+@pytest.mark.parametrize(("simulator", "expected"), WARNED)
 def test_warnings_do_not_fail(simulator, expected):
     report = check(simulator)
     assert report.is_ready
     assert any(expected in warning for warning in report.warnings)
 
 
-@pytest.mark.parametrize(
-    ("name", "noise", "status", "text"),
-    [
-        ("robot_a", "torch.randn_like(theta)", 0, "\nready\n"),
-        ("robot_b", "0", 1, "defect: "),
-        ("json", "0", 2, "expected a file whose name no other module has"),
-    ],
-)
+#: Names of files, their noise, exit status, and what is said.
+COMMANDS = [
+    ("robot_a", "torch.randn_like(theta)", 0, "\nready\n"),
+    ("robot_b", "0", 1, "defect: "),
+    ("json", "0", 2, "expected a file whose name no other module has"),
+]
+
+
+@pytest.mark.parametrize(("name", "noise", "status", "text"), COMMANDS)
 def test_the_command(tmp_path, capsys, monkeypatch, name, noise, status, text):
     monkeypatch.setattr(sys, "path", [*sys.path])
     lines = "import torch\n", "def fn(theta, action):\n", f"    return theta + {noise}"

@@ -8,9 +8,9 @@ import pytest
 import torch
 from torch.distributions import Normal
 
-from sbi_active import GaussianNoise, SimulatorModel, simulate
+from sbi_active import SimulatorModel, simulate
 from sbi_active.criticism import AugmentedSimulator
-from sbi_active.tasks import get_task  # pyright: ignore
+from sbi_active.tasks import get_task
 from sbi_active.tasks.box_collision import BoxCollisionReference
 from sbi_active.tasks.box_collision.model import positions
 from sbi_active.tasks.box_collision.scene import LocalScene
@@ -97,7 +97,7 @@ def test_moves_the_cube_as_it_should(name):
     strength, axis, sign = SIGNS[name]
     theta, action = torch.full((1, 3), 0.2), torch.tensor([[5.0]])
     setup = partial(LocalScene, edge=10.0)
-    wide = SimulatorModel(positions, noise=GaussianNoise(TASK.noise), setup=setup)
+    wide = SimulatorModel(positions, noise=TASK.noise, setup=setup)
     phi = {name: torch.full((1, 1), strength)}
     x = AugmentedSimulator(wide, [EFFECTS[name]]).evaluate(theta, phi, action)
     shift = float((x - wide.mean(theta, action))[0, axis])
@@ -116,7 +116,7 @@ def slide(theta, action):
     return torch.stack([x, 0 * x, 0 * x + 0.075], -1)
 
 
-MODEL = SimulatorModel(slide, noise=GaussianNoise(SD))
+MODEL = SimulatorModel(slide, noise=SD)
 TRUTH = torch.tensor([[0.6, 0.5, 0.4]])
 
 

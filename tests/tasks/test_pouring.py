@@ -6,7 +6,7 @@ import torch
 from scipy.ndimage import maximum_filter
 
 from sbi_active import simulate
-from sbi_active.tasks import get_task  # pyright: ignore
+from sbi_active.tasks import get_task
 from sbi_active.tasks.pouring import ImagePCA, intersection_volume
 from sbi_active.tasks.pouring.materials import cubes
 from sbi_active.tasks.pouring.raster import height_image, rotations

@@ -7,27 +7,17 @@ import pandas as pd
 import pytest
 import torch
 
-from sbi_active.tasks import (
-    ball_and_hoop,  # pyright: ignore
-    cascaded_tanks,  # pyright: ignore
-    get_task,  # pyright: ignore
-)
-from sbi_active.tasks.ball_and_hoop import spin  # pyright: ignore
-from sbi_active.tasks.cascaded_tanks import (
-    levels,  # pyright: ignore
-    start_levels,  # pyright: ignore
-)
-from sbi_active.tasks.records import (
-    Record,  # pyright: ignore
-    cut,  # pyright: ignore
-)
+from sbi_active.tasks import ball_and_hoop, cascaded_tanks, get_task
+from sbi_active.tasks.ball_and_hoop import spin
+from sbi_active.tasks.cascaded_tanks import levels, start_levels
+from sbi_active.tasks.records import Record, cut
 from sbi_active.tasks.servo_pendulum import (
     Recordings,
     ServoPendulumTask,
     read_recordings,
 )
 from sbi_active.tasks.servo_pendulum.model import GRAVITY, LENGTH, MASS, STEP, SUPPLY
-from sbi_active.tasks.stepping import lagged  # pyright: ignore
+from sbi_active.tasks.stepping import lagged
 
 HOOP = torch.tensor([[7.3, 0.8, 0.0]], dtype=torch.float64)
 TANKS = torch.tensor([[0.05, 0.05, 0.05, 0.04]], dtype=torch.float64)

@@ -3,15 +3,11 @@
 import torch
 from sbi.utils import BoxUniform
 
-from sbi_active import (
-    BoxActions,
-    Campaign,
-    CampaignOptions,
-    GaussianNoise,
-    MixtureDensity,
-    SimulatorModel,
-)
+from sbi_active.actions import BoxActions
+from sbi_active.campaign import Campaign, CampaignOptions
 from sbi_active.campaign.options import CampaignDetails
+from sbi_active.inference import MixtureDensity
+from sbi_active.simulation import SimulatorModel
 from tests.campaign.problem import REFINEMENT
 
 PRIOR = BoxUniform(torch.zeros(2), torch.ones(2))
@@ -34,7 +30,7 @@ def drawn(theta, action):
     return mean(theta, action) + 0.1 * torch.randn(len(theta), 4)
 
 
-MODEL = SimulatorModel(mean, noise=GaussianNoise(0.1), parameter_names=["a", "b"])
+MODEL = SimulatorModel(mean, noise=0.1, parameter_names=["a", "b"])
 
 
 def outcome(action, index):

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import torch
 
+from sbi_active import StopRules
 from sbi_active.campaign.storage import codec
 from sbi_active.campaign.storage.codec import Absent, NotStorableError, decode, encode
 from sbi_active.campaign.storage.directory import Storage
@@ -122,6 +123,8 @@ def test_fields_that_came_later_have_their_defaults():
     old = Called(codec.made, kind, {"index": 3, "action": None})
     trial = decode(written(old), known={})
     assert (trial.index, trial.status, trial.seconds) == (3, "pending", {})
+    options = codec.made("sbi_active.campaign.options:StopRules", {"budget": 2.0})
+    assert options == StopRules(budget=2.0)
 
 
 def test_other_checkpoints_may_call_no_more_than_before():

@@ -20,6 +20,7 @@ from sbi_active.messages import StorageWarning
 from sbi_active.simulation.bank import CorruptSegmentError
 from sbi_active.simulation.bank.store import Store
 from tests.campaign.storage.campaigns import MODEL, PRIOR, draws, facts, go_on, new
+from tests.campaign.storage.test_codec import Called
 from tests.simulation.bank.filled import FILE, crafted, execute, filled, flip
 
 
@@ -116,11 +117,6 @@ def test_a_damaged_manifest_another_format_or_a_bank_is_no_campaign(folder, tmp_
         Campaign.load(filled(tmp_path / "bank"))
 
 
-class Bomb:
-    def __reduce__(self):
-        return (os.mkdir, ("exploded",))
-
-
 @pytest.fixture(scope="module")
 def short(tmp_path_factory):
     """A campaign of one trial, to copy."""
@@ -132,14 +128,15 @@ def short(tmp_path_factory):
 @pytest.mark.parametrize("kind", ["state", "belief", "campaign", "log", "prior"])
 def test_nothing_is_executed(short, tmp_path, kind):
     folder, saved = shutil.copytree(short, tmp_path / "c"), io.BytesIO()
-    torch.save({"lines": Bomb()}, saved)
-    bomb = pickle.dumps(Bomb())
+    exploding = Called(os.mkdir, "exploded")
+    torch.save({"lines": exploding}, saved)
+    bomb = pickle.dumps(exploding)
     for content in (bomb, zlib.compress(bomb), zlib.compress(saved.getvalue())):
         crafted(folder, kind, int(kind == "log"), content)
         with contextlib.suppress(ValueError, OSError):
             Campaign.load(folder, simulator=MODEL).update()
         assert not (tmp_path / "exploded").exists()
-    (folder / FILE).write_bytes(pickle.dumps(Bomb()))
+    (folder / FILE).write_bytes(bomb)
     with pytest.raises(CorruptSegmentError):
         Campaign.load(folder)
     assert not (tmp_path / "exploded").exists()

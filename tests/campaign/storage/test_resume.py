@@ -11,18 +11,7 @@ from sbi_active import Bank, BoxActions, Campaign, SimulatorModel
 from sbi_active.campaign.storage.directory import is_mean
 from sbi_active.simulation import reuse
 from sbi_active.simulation.bank import LockedError
-from tests.campaign.storage.campaigns import (
-    ACTIONS,
-    MODEL,
-    OPTIONS,
-    PRIOR,
-    drawn,
-    draws,
-    facts,
-    go_on,
-    new,
-    outcome,
-)
+from tests.campaign.storage import campaigns
 from tests.effects import BIAS
 from tests.simulation.bank.filled import execute
 
@@ -31,43 +20,44 @@ CALLS = []  # sizes of what was simulated
 
 def counted(theta, action):
     CALLS.append(len(theta))
-    return drawn(theta, action)
+    return campaigns.drawn(theta, action)
 
 
-@pytest.mark.parametrize(
-    ("simulator", "given"),
-    [
-        (MODEL, {"method": "asbi"}),
-        (drawn, {"method": "nlhi"}),
-        (MODEL, {"options": {"max_simulations": 100, "planned_trials": 2}}),
-    ],
-)
+#: Simulators, and what else is given.
+LEFT = [
+    (campaigns.MODEL, {"method": "asbi"}),
+    (campaigns.drawn, {"method": "nlhi"}),
+    (campaigns.MODEL, {"options": {"max_simulations": 100, "planned_trials": 2}}),
+]
+
+
+@pytest.mark.parametrize(("simulator", "given"), LEFT)
 def test_left_after_every_step(tmp_path, simulator, given):
     given = {"simulator": simulator, "actions": [0.5, 1.0, 2.0], **given}
-    whole = go_on(new(**given), 2)
+    whole = campaigns.go_on(campaigns.new(**given), 2)
 
-    campaign = new(tmp_path / "c", **given)
+    campaign = campaigns.new(tmp_path / "c", **given)
     for index in range(2):
         action = campaign.ask().action
         campaign.close()
         campaign = Campaign.load(tmp_path / "c", simulator=simulator)
         assert torch.equal(campaign.pending.action, action)
         assert campaign.pending.design is not None
-        campaign.tell(outcome(action, index))
+        campaign.tell(campaigns.outcome(action, index))
         campaign.close()
         campaign = Campaign.load(tmp_path / "c", simulator=simulator)
     campaign.update()
     campaign.close()
     campaign = Campaign.load(tmp_path / "c", simulator=simulator)
 
-    assert torch.equal(draws(campaign), draws(whole))
-    assert facts(campaign) == facts(whole)
+    assert torch.equal(campaigns.draws(campaign), campaigns.draws(whole))
+    assert campaigns.facts(campaign) == campaigns.facts(whole)
     if whole.state.meter.limit is not None:
         assert campaign.state.meter.spent == whole.state.meter.spent
 
 
 def test_what_follows_is_computed_again_from_the_log_without_simulating(tmp_path):
-    whole = go_on(new(tmp_path / "c", simulator=counted), 2)
+    whole = campaigns.go_on(campaigns.new(tmp_path / "c", simulator=counted), 2)
     whole.close()
     execute(tmp_path / "c", "DELETE FROM records WHERE kind IN ('state', 'belief')")
     CALLS.clear()
@@ -75,38 +65,40 @@ def test_what_follows_is_computed_again_from_the_log_without_simulating(tmp_path
     campaign = Campaign.load(tmp_path / "c", simulator=counted)
     campaign.update()
 
-    assert torch.equal(draws(campaign), draws(whole))
-    assert facts(campaign) == facts(whole)
+    assert torch.equal(campaigns.draws(campaign), campaigns.draws(whole))
+    assert campaigns.facts(campaign) == campaigns.facts(whole)
     assert not CALLS
 
 
 def test_without_a_simulator_it_is_read_told_and_corrected(tmp_path):
-    whole = go_on(new(tmp_path / "c"), 1)
+    whole = campaigns.go_on(campaigns.new(tmp_path / "c"), 1)
     action = whole.ask().action
     whole.close()
 
     reader = Campaign.load(tmp_path / "c")
-    assert torch.equal(draws(reader), draws(whole))
+    assert torch.equal(campaigns.draws(reader), campaigns.draws(whole))
     assert reader.health == whole.health
     assert reader.pending.index == 1
-    reader.tell(outcome(action, 1))
+    reader.tell(campaigns.outcome(action, 1))
     with pytest.raises(ValueError, match="pass it: Campaign.load"):
         reader.update()
-    reader.correct(0, 2 * outcome(action, 0), reason="gain of 2")
+    reader.correct(0, 2 * campaigns.outcome(action, 0), reason="gain of 2")
+    assert reader.not_in_belief == [0, 1]  # which rests on what was told before
+    assert "corrected since" in reader.belief.diagnostics.warnings[0]
     reader.close()
 
-    whole = new()
+    whole = campaigns.new()
     for trial in reader.history:
         whole.attach(trial.action, trial.x)
     whole.update()
-    again = Campaign.load(tmp_path / "c", simulator=MODEL)
+    again = Campaign.load(tmp_path / "c", simulator=campaigns.MODEL)
     again.update()
-    assert torch.equal(draws(again), draws(whole))
+    assert torch.equal(campaigns.draws(again), campaigns.draws(whole))
     assert again.history[0].reason == "gain of 2"
 
 
 def test_correct_and_withdraw_keep_the_old_lines_beside_a_pending_trial(tmp_path):
-    campaign, x = new(tmp_path / "c"), torch.tensor([0.3, 0.5, 0.7, 0.9])
+    campaign, x = campaigns.new(tmp_path / "c"), torch.tensor([0.3, 0.5, 0.7, 0.9])
     campaign.attach([1.0], x)
     campaign.attach([1.5], x)
     asked = campaign.ask()
@@ -132,57 +124,57 @@ def test_correct_and_withdraw_keep_the_old_lines_beside_a_pending_trial(tmp_path
 
 
 def test_one_writer_any_number_of_readers(tmp_path):
-    campaign = go_on(new(tmp_path / "c"), 1)
-    other = Campaign.load(tmp_path / "c", simulator=MODEL)
-    assert torch.equal(draws(other), draws(campaign))
+    campaign = campaigns.go_on(campaigns.new(tmp_path / "c"), 1)
+    other = Campaign.load(tmp_path / "c", simulator=campaigns.MODEL)
+    assert torch.equal(campaigns.draws(other), campaigns.draws(campaign))
     with pytest.raises(LockedError, match="expected no other writer"):
         other.tell([0.0] * 4, action=[1.0])
     campaign.tell([0.3] * 4, action=[1.0])
     campaign.close()
     with pytest.raises(ValueError, match="load it again"):
         other.tell([0.0] * 4, action=[1.0])
-    with Campaign.load(tmp_path / "c", simulator=MODEL) as third:
+    with Campaign.load(tmp_path / "c", simulator=campaigns.MODEL) as third:
         assert len(third.history) == 2
 
 
 def test_a_new_campaign_wants_an_empty_directory(tmp_path):
-    new(tmp_path / "c").close()
+    campaigns.new(tmp_path / "c").close()
     with pytest.raises(ValueError, match=r"go on by Campaign\.load"):
-        new(tmp_path / "c")
+        campaigns.new(tmp_path / "c")
     (tmp_path / "other").mkdir()
     (tmp_path / "other" / "thesis.tex").touch()
     with pytest.raises(ValueError, match=r"with \['thesis\.tex'\]; choose another"):
-        new(tmp_path / "other")
+        campaigns.new(tmp_path / "other")
     with pytest.raises(ValueError, match=r"expected a campaign; got no .*store\.db"):
         Campaign.load(tmp_path / "other")
 
 
 @pytest.mark.parametrize("told_since", [False, True])
 def test_another_simulator_is_refused_or_not_forgotten_by_a_kill(tmp_path, told_since):
-    with new(tmp_path / "c", simulator=drawn) as campaign:
-        campaign.attach([1.0], outcome(torch.ones(1), 1))
+    with campaigns.new(tmp_path / "c", simulator=campaigns.drawn) as campaign:
+        campaign.attach([1.0], campaigns.outcome(torch.ones(1), 1))
         campaign.update()
 
     def mended(theta, action):
-        return drawn(theta, action) + 0.1
+        return campaigns.drawn(theta, action) + 0.1
 
     with pytest.raises(ValueError, match="got another: simulator.*source"):
         Campaign.load(tmp_path / "c", simulator=mended)
     changed = Campaign.load(tmp_path / "c", simulator=mended, simulator_changed=True)
     if told_since:
-        changed.attach([1.0], outcome(torch.tensor([1.0]), 2))
+        changed.attach([1.0], campaigns.outcome(torch.tensor([1.0]), 2))
     changed.close()  # as a kill before the next update: nothing was saved
     assert Campaign.load(tmp_path / "c", simulator=mended).state.is_stale
-    anew = new(simulator=mended)
+    anew = campaigns.new(simulator=mended)
     with Campaign.load(tmp_path / "c", simulator=mended) as campaign:
         campaign.update()
     for trial in campaign.history:
         anew.attach(trial.action, trial.x)
     anew.update()
-    assert torch.equal(draws(campaign), draws(anew))
+    assert torch.equal(campaigns.draws(campaign), campaigns.draws(anew))
     again = Campaign.load(tmp_path / "c", simulator=mended)
     assert not again.state.is_stale  # the update after the change was saved
-    assert torch.equal(draws(again), draws(anew))
+    assert torch.equal(campaigns.draws(again), campaigns.draws(anew))
 
 
 def price(action):
@@ -195,18 +187,22 @@ class OwnPrior(Uniform):
 
 def test_what_only_its_author_can_make_is_asked_for(tmp_path):
     prior = torch.distributions.Independent(OwnPrior(torch.zeros(2), torch.ones(2)), 1)
-    campaign = go_on(new(tmp_path / "c", prior=prior, cost=price), 1)
+    campaign = campaigns.go_on(
+        campaigns.new(tmp_path / "c", prior=prior, cost=price), 1
+    )
     campaign.close()
     with pytest.raises(ValueError, match="expected prior=, which only its author"):
-        Campaign.load(tmp_path / "c", simulator=MODEL, cost=price)
+        Campaign.load(tmp_path / "c", simulator=campaigns.MODEL, cost=price)
     with pytest.raises(ValueError, match="expected prior=, which only its author"):
         Campaign.load(tmp_path / "c")
     reader = Campaign.load(tmp_path / "c", prior=prior)
-    assert torch.equal(draws(reader), draws(campaign))
+    assert torch.equal(campaigns.draws(reader), campaigns.draws(campaign))
     with pytest.raises(ValueError, match=r"limits .*\['cost'\]; got \[\]"):
-        Campaign.load(tmp_path / "c", simulator=MODEL, prior=prior)
-    again = Campaign.load(tmp_path / "c", simulator=MODEL, prior=prior, cost=price)
-    assert torch.equal(draws(again), draws(campaign))
+        Campaign.load(tmp_path / "c", simulator=campaigns.MODEL, prior=prior)
+    again = Campaign.load(
+        tmp_path / "c", simulator=campaigns.MODEL, prior=prior, cost=price
+    )
+    assert torch.equal(campaigns.draws(again), campaigns.draws(campaign))
 
 
 def test_another_prior_or_space_is_refused(tmp_path):
@@ -214,9 +210,9 @@ def test_another_prior_or_space_is_refused(tmp_path):
         return torch.distributions.Independent(kind(torch.zeros(2), high), 1)
 
     own = of(OwnPrior, torch.ones(2))
-    for name, prior in (("own", own), ("stored", PRIOR)):
-        new(tmp_path / name, prior=prior).close()
-        Campaign.load(tmp_path / name, prior=prior, actions=ACTIONS)
+    for name, prior in (("own", own), ("stored", campaigns.PRIOR)):
+        campaigns.new(tmp_path / name, prior=prior).close()
+        Campaign.load(tmp_path / name, prior=prior, actions=campaigns.ACTIONS)
         for another in (of(OwnPrior, 2 * torch.ones(2)), of(Uniform, torch.ones(2))):
             with pytest.raises(ValueError, match="the prior of the campaign; got an"):
                 Campaign.load(tmp_path / name, prior=another)
@@ -226,9 +222,9 @@ def test_another_prior_or_space_is_refused(tmp_path):
 
 
 def test_adopted_effects_come_back(tmp_path):
-    campaign = new(tmp_path / "c", simulator=MODEL, effects=[BIAS])
+    campaign = campaigns.new(tmp_path / "c", simulator=campaigns.MODEL, effects=[BIAS])
     for index, action in enumerate(torch.linspace(0.5, 2.0, 3)):
-        campaign.attach([float(action)], outcome(action[None], index) + 0.5)
+        campaign.attach([float(action)], campaigns.outcome(action[None], index) + 0.5)
     report = campaign.criticize(evaluate=False)
     assert report.verdict == "bias"
     campaign.adopt(report)
@@ -237,39 +233,41 @@ def test_adopted_effects_come_back(tmp_path):
     campaign.close()
 
     reader = Campaign.load(tmp_path / "c")
-    assert torch.equal(draws(reader), draws(campaign))
+    assert torch.equal(campaigns.draws(reader), campaigns.draws(campaign))
     assert reader.parameter_names == ["a", "b", "bias"]
     with pytest.raises(ValueError, match="expected the effects of .*, bias; got"):
-        Campaign.load(tmp_path / "c", simulator=MODEL)
-    again = Campaign.load(tmp_path / "c", simulator=MODEL, effects=[BIAS])
+        Campaign.load(tmp_path / "c", simulator=campaigns.MODEL)
+    again = Campaign.load(tmp_path / "c", simulator=campaigns.MODEL, effects=[BIAS])
     assert again.state.version.effects == ("bias",)
-    assert torch.equal(draws(again), draws(campaign))
-    assert draws(again).shape[1] == 3
-    again.attach([1.0], outcome(torch.tensor([1.0]), 7) + 0.5)
+    assert torch.equal(campaigns.draws(again), campaigns.draws(campaign))
+    assert campaigns.draws(again).shape[1] == 3
+    again.attach([1.0], campaigns.outcome(torch.tensor([1.0]), 7) + 0.5)
     again.update()
     assert again.history[-1].version == 1
 
 
 def test_rows_of_a_campaign_are_used_again(tmp_path):
-    with new(tmp_path / "c", simulator=counted, method="asbi") as campaign:
+    with campaigns.new(tmp_path / "c", simulator=counted, method="asbi") as campaign:
         assert campaign.posterior is not None  # the first round's network
-    worth = reuse(Bank(tmp_path / "c", name="drawn"), PRIOR).effective_sample_size
-    assert worth == pytest.approx(OPTIONS.num_simulations)
+    worth = reuse(
+        Bank(tmp_path / "c", name="drawn"), campaigns.PRIOR
+    ).effective_sample_size
+    assert worth == pytest.approx(campaigns.OPTIONS.num_simulations)
 
 
 def test_rows_are_kept_of_a_simulator_and_of_its_mean_alone():
-    mean = copy.copy(MODEL)
+    mean = copy.copy(campaigns.MODEL)
     mean.noise = None
-    assert is_mean(mean, MODEL)
-    assert not is_mean(drawn, MODEL)
-    drifting = SimulatorModel(drawn)
+    assert is_mean(mean, campaigns.MODEL)
+    assert not is_mean(campaigns.drawn, campaigns.MODEL)
+    drifting = SimulatorModel(campaigns.drawn)
     later = copy.copy(drifting)
     later.next_index = 3  # another simulator, with other rows
     assert not is_mean(later, drifting)
 
 
 def test_a_pickled_copy_lives_in_memory(tmp_path):
-    campaign = go_on(new(tmp_path / "c"), 1)
+    campaign = campaigns.go_on(campaigns.new(tmp_path / "c"), 1)
     copy = pickle.loads(pickle.dumps(campaign))
     copy.tell([0.1] * 4, action=[1.0])
     assert len(campaign.history) == 1

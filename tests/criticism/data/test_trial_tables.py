@@ -119,16 +119,17 @@ def test_a_table_in_another_encoding(encoding):
         Trials.from_csv("trials.csv")
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"columns": {"y": "x_y"}}, "columns of trial, time, .*; got y"),
-        ({"columns": {"x": "x_z"}}, "a column x_z for x; got .*'x_y'"),
-        ({"columns": {"time": ["time", "x_y"]}}, "one column for time; got time, x_y"),
-        ({"units": {"x_z": "m"}}, "got one of x_z"),
-        ({"order": "sorted"}, "expected order 'known' or 'unknown'; got"),
-    ],
-)
+#: Options, and what is said of them.
+UNFIT = [
+    ({"columns": {"y": "x_y"}}, "columns of trial, time, .*; got y"),
+    ({"columns": {"x": "x_z"}}, "a column x_z for x; got .*'x_y'"),
+    ({"columns": {"time": ["time", "x_y"]}}, "one column for time; got time, x_y"),
+    ({"units": {"x_z": "m"}}, "got one of x_z"),
+    ({"order": "sorted"}, "expected order 'known' or 'unknown'; got"),
+]
+
+
+@pytest.mark.parametrize(("options", "message"), UNFIT)
 def test_options_that_do_not_fit_the_table(options, message):
     with pytest.raises(ValueError, match=message):
         read(["1,0,1,5"], SHORT, **options)
@@ -148,13 +149,14 @@ def long(**changes):
     return pd.DataFrame({**columns, **changes})
 
 
-@pytest.mark.parametrize(
-    ("ids", "names"),
-    [
-        ([20261101.0, 20261102.0], ("20261101", "20261102")),
-        ([1e15, 1e15 + 1], ("1000000000000000", "1000000000000001")),
-    ],
-)
+#: Numbers, and the names of trials.
+DIGITS = [
+    ([20261101.0, 20261102.0], ("20261101", "20261102")),
+    ([1e15, 1e15 + 1], ("1000000000000000", "1000000000000001")),
+]
+
+
+@pytest.mark.parametrize(("ids", "names"), DIGITS)
 def test_numbers_that_name_trials_keep_their_digits(ids, names):
     trials = Trials.from_dataframe(long(trial=np.repeat(ids, 2)))
     assert trials.names == names
@@ -210,29 +212,31 @@ def test_a_file_a_trial():
 BALLS = {"trial": "ball", "time": "t", "x": "h", "action": "u"}
 
 
-@pytest.mark.parametrize(
-    ("header", "columns", "first", "names"),
-    [
-        ("action_v,x_y", None, ["1,2", "2,3"], ("0", "1", "2")),
-        (f"trial,{HEADER}", None, ["1,0,1,5", "2,0,2,5"], ("a 1", "a 2", "b 1")),
-        ("ball,t,u,h", BALLS, ["1,0,1,6", "2,0,1,7"], ("a 1", "a 2", "b 1")),
-    ],
-)
+#: Headers, columns, first rows, and names.
+SEVERAL = [
+    ("action_v,x_y", None, ["1,2", "2,3"], ("0", "1", "2")),
+    (f"trial,{HEADER}", None, ["1,0,1,5", "2,0,2,5"], ("a 1", "a 2", "b 1")),
+    ("ball,t,u,h", BALLS, ["1,0,1,6", "2,0,1,7"], ("a 1", "a 2", "b 1")),
+]
+
+
+@pytest.mark.parametrize(("header", "columns", "first", "names"), SEVERAL)
 def test_files_of_several_trials_name_their_file(header, columns, first, names):
     write_run("a.csv", *first, header=header)
     write_run("b.csv", first[0] + ".5", header=header)
     assert Trials.from_csv("runs", columns=columns).names == names
 
 
-@pytest.mark.parametrize(
-    ("rows", "header", "message"),
-    [
-        (["0,1,5"], "time_s,action_speed[m/s],x_height[m]", r"columns .*runs/b\.csv"),
-        (["0,1,5", "100,1,6"], HEADER, "same numbers in trials a and b of runs"),
-        (["0,1,5.5", "1,1,5 m"], HEADER, r"x_height\[m\], row 2 .*runs/b.csv"),
-        ([], HEADER, r"no rows in runs/b\.csv"),
-    ],
-)
+#: Rows and header of a second file, and what is said of it.
+APART = [
+    (["0,1,5"], "time_s,action_speed[m/s],x_height[m]", r"columns .*runs/b\.csv"),
+    (["0,1,5", "100,1,6"], HEADER, "same numbers in trials a and b of runs"),
+    (["0,1,5.5", "1,1,5 m"], HEADER, r"x_height\[m\], row 2 .*runs/b.csv"),
+    ([], HEADER, r"no rows in runs/b\.csv"),
+]
+
+
+@pytest.mark.parametrize(("rows", "header", "message"), APART)
 def test_recordings_that_do_not_go_together(rows, header, message, tmp_path):
     with pytest.raises(ValueError, match="expected recordings in .*; got no"):
         Trials.from_csv(tmp_path)

@@ -6,7 +6,7 @@ import torch
 from sbi.utils import BoxUniform
 from torch.distributions import HalfNormal, LogNormal, Normal, Uniform
 
-from sbi_active import Campaign, DiscreteActions, GaussianNoise, SimulatorModel
+from sbi_active import Campaign, DiscreteActions, SimulatorModel
 from sbi_active.criticism import (
     AugmentedSimulator,
     Criticism,
@@ -15,13 +15,12 @@ from sbi_active.criticism import (
     joint_prior,
 )
 from sbi_active.criticism.effects.effect import require_nested
+from tests.criticism.slope_world import MODEL, PRIOR
 from tests.effects import effect
 
 NAN, NORMAL = float("nan"), Normal(0.0, 1.0)
-PRIOR = BoxUniform(-3 * torch.ones(1), 3 * torch.ones(1))
 SPEED = torch.tensor([1.0, 2.0, 3.0, 2.0, 1.5])
 STOP = 0.7 * SPEED + 0.1 * torch.tensor([0.3, -1.2, 0.8, 0.1, -0.4])
-MODEL = SimulatorModel(lambda theta, xi: theta * xi, noise=GaussianNoise(0.1))
 ACTIONS = DiscreteActions([1.0, 1.5, 2.0, 3.0])
 
 
@@ -29,32 +28,34 @@ def loop(*effects, model=MODEL):
     return Criticism(model, PRIOR, Trials(SPEED, STOP), effects=effects)
 
 
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"null": NAN}, "expected a null of effect 'bias'; got NaN"),
-        ({"null": [0.0, 0.0]}, r"expected a null of effect 'bias' of shape \(1,\)"),
-        ({"prior": 1.0}, "expected a continuous torch prior of effect 'bias'"),
-        ({"prior": LogNormal(0.0, 200.0)}, "expected finite draws .*; got NaN or inf"),
-    ],
-)
+#: Parts that are none, and what is said of them.
+NO_PARTS = [
+    ({"null": NAN}, "expected a null of effect 'bias'; got NaN"),
+    ({"null": [0.0, 0.0]}, r"expected a null of effect 'bias' of shape \(1,\)"),
+    ({"prior": 1.0}, "expected a continuous torch prior of effect 'bias'"),
+    ({"prior": LogNormal(0.0, 200.0)}, "expected finite draws .*; got NaN or inf"),
+]
+
+
+@pytest.mark.parametrize(("changes", "message"), NO_PARTS)
 def test_parts_that_are_none_are_refused(changes, message):
     with pytest.raises(ValueError, match=message):
         effect(**changes)
 
 
-@pytest.mark.parametrize(
-    ("prior", "null", "is_taken"),
-    [
-        (Uniform(1.0, 2.0), 0.0, False),
-        (HalfNormal(1.0), -0.5, False),
-        (Uniform(torch.zeros(2), torch.ones(2)), torch.tensor([0.0, 1.5]), False),
-        (Normal(0.0, 1.0), 0.0, True),
-        (Uniform(-1.0, 0.0), 0.0, True),
-        (LogNormal(0.0, 1.0), 0.0, True),
-        (BoxUniform(torch.zeros(1), torch.ones(1)), 0.0, True),
-    ],
-)
+#: Priors, nulls, and whether one allows the other.
+NULLS = [
+    (Uniform(1.0, 2.0), 0.0, False),
+    (HalfNormal(1.0), -0.5, False),
+    (Uniform(torch.zeros(2), torch.ones(2)), torch.tensor([0.0, 1.5]), False),
+    (Normal(0.0, 1.0), 0.0, True),
+    (Uniform(-1.0, 0.0), 0.0, True),
+    (LogNormal(0.0, 1.0), 0.0, True),
+    (BoxUniform(torch.zeros(1), torch.ones(1)), 0.0, True),
+]
+
+
+@pytest.mark.parametrize(("prior", "null", "is_taken"), NULLS)
 def test_a_prior_allows_its_null_within_or_on_its_edge(prior, null, is_taken):
     def apply(value, phi, action, context):
         return value + (phi - torch.as_tensor(null)).sum(-1, keepdim=True)
@@ -119,23 +120,19 @@ def louder(sd, phi, action, context):
     return sd
 
 
-@pytest.mark.parametrize(
-    ("hook", "apply", "prior", "message"),
-    [
-        ("observation", no_change, NORMAL, r"of shape \(16, 1\); got NoneType"),
-        ("observation", lambda v, phi, a, c: v + phi[:, 0], NORMAL, r"got \(16, 16\)"),
-        ("action", lambda v, phi, a, c: (v + phi)[:, 0], NORMAL, r"got \(16,\)"),
-        ("dynamics", no_change, NORMAL, "a dict of keyword arguments; got NoneType"),
-        ("noise", lambda v, phi, a, c: phi, NORMAL, "vanish at its null"),
-        ("noise", louder, HalfNormal(1.0), r"the noise changed by up to 0\.5"),
-        (
-            "noise",
-            lambda v, phi, a, c: v * (1 + phi),
-            Normal(0.0, 2.0),
-            "positive; got",
-        ),
-    ],
-)
+#: Hooks, what apply returns, priors, and what is said.
+RETURNED = [
+    ("observation", no_change, NORMAL, r"of shape \(16, 1\); got NoneType"),
+    ("observation", lambda v, phi, a, c: v + phi[:, 0], NORMAL, r"got \(16, 16\)"),
+    ("action", lambda v, phi, a, c: (v + phi)[:, 0], NORMAL, r"got \(16,\)"),
+    ("dynamics", no_change, NORMAL, "a dict of keyword arguments; got NoneType"),
+    ("noise", lambda v, phi, a, c: phi, NORMAL, "vanish at its null"),
+    ("noise", louder, HalfNormal(1.0), r"the noise changed by up to 0\.5"),
+    ("noise", lambda v, phi, a, c: v * (1 + phi), Normal(0.0, 2.0), "positive; got"),
+]
+
+
+@pytest.mark.parametrize(("hook", "apply", "prior", "message"), RETURNED)
 def test_apply_that_returns_something_else_is_named(hook, apply, prior, message):
     with pytest.raises(ValueError, match=f"(?s)effect 'bias'.*{message}"):
         loop(effect(hook=hook, apply=apply, prior=prior))

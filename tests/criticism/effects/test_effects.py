@@ -5,7 +5,7 @@ import torch
 from sbi.utils import BoxUniform
 from torch.distributions import HalfNormal, Independent, Normal
 
-from sbi_active import DiscreteActions, GaussianNoise, SimulatorModel
+from sbi_active import DiscreteActions, SimulatorModel
 from sbi_active.criticism import (
     AugmentedSimulator,
     Context,
@@ -14,7 +14,7 @@ from sbi_active.criticism import (
     joint_prior,
 )
 from sbi_active.simulation import simulate
-from tests.effects import effect
+from tests.effects import drift, effect
 
 PRIOR = BoxUniform(-torch.ones(2), torch.ones(2))
 ACTIONS = DiscreteActions(torch.linspace(-2, 2, 9))
@@ -25,7 +25,7 @@ def line(theta, action, curvature=0.0):
     return (theta[:, 0] + theta[:, 1] * xi + curvature * xi**2)[:, None]
 
 
-MODEL = SimulatorModel(line, noise=GaussianNoise(0.1), parameter_names=["a", "b"])
+MODEL = SimulatorModel(line, noise=0.1, parameter_names=["a", "b"])
 
 
 HOOKS = {
@@ -75,13 +75,14 @@ def test_noise_effects_stretch_the_noise():
     assert float(x.std()) == pytest.approx(0.3, abs=4 * 0.3 / math.sqrt(8_000))
 
 
-@pytest.mark.parametrize(
-    ("wrong", "size"),
-    [
-        (effect(null=0.5), "0.5"),
-        (effect(apply=lambda x, phi, a, c: x + phi + 0.25), "0.25"),
-    ],
-)
+#: Effects, and by how much they change what they should not.
+NOT_NESTED = [
+    (effect(null=0.5), "0.5"),
+    (effect(apply=lambda x, phi, a, c: x + phi + 0.25), "0.25"),
+]
+
+
+@pytest.mark.parametrize(("wrong", "size"), NOT_NESTED)
 def test_an_effect_that_does_not_vanish_is_named_with_its_size(wrong, size):
     check = PRIOR.sample((16,)), ACTIONS.sample((16,), seed=0)
     with pytest.raises(ValueError, match=f"effect 'bias' to vanish.*up to {size}"):
@@ -103,8 +104,7 @@ def test_a_null_at_infinity():
 
 
 def test_the_index_of_a_plain_call_is_the_next_trial():
-    drift = effect("drift", apply=lambda x, phi, a, c: x + phi * c.index[:, None])
-    model = AugmentedSimulator(MODEL, [drift], next_index=8)
+    model = AugmentedSimulator(MODEL, [drift()], next_index=8)
     x = model.mean(torch.tensor([[0.0, 0.0, 0.5]]), torch.zeros(1, 1))
     assert x.item() == pytest.approx(4.0)
     given = torch.zeros(3, 2), {"drift": torch.ones(3, 1)}, torch.zeros(3, 1)

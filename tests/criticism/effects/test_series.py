@@ -7,7 +7,7 @@ import pytest
 import torch
 from sbi.utils import BoxUniform
 
-from sbi_active import GaussianNoise, SimulatorModel
+from sbi_active import SimulatorModel
 from sbi_active.criticism import Trials, close_loop, varying_parameters
 from sbi_active.criticism.effects import changes
 from sbi_active.criticism.effects.first_samples import start_from_first_samples
@@ -53,9 +53,8 @@ def test_a_backlash_is_that_of_its_definition():
     expected = torch.empty_like(u)
     y = u[:, 0]
     for k in range(57):
-        y = torch.minimum(
-            torch.maximum(y, u[:, k] - width[:, 0] / 2), u[:, k] + width[:, 0] / 2
-        )
+        half = width[:, 0] / 2
+        y = torch.minimum(torch.maximum(y, u[:, k] - half), u[:, k] + half)
         expected[:, k] = y
     assert torch.equal(changes.played(u, width), expected)
     assert torch.equal(expected[0], u[0])
@@ -137,9 +136,8 @@ def lines(num=400):
 def test_errors_of_the_center_are_those_that_the_width_says():
     trials, place, speed = lines()
     wanted = {"place": 0, "speed": (0, 1)}
-    found, nuisance = start_from_first_samples(
-        trials, wanted, within=0.55, sd=SENSOR, at=0.0, width=1.0
-    )
+    own = {"within": 0.55, "sd": SENSOR, "at": 0.0, "width": 1.0}
+    found, nuisance = start_from_first_samples(trials, wanted, **own)
     deviations = nuisance.prior.stddev
     for name, truth, sd in zip(wanted, (place, speed), deviations, strict=True):
         z = (found.start[name] - truth) / sd
@@ -202,33 +200,30 @@ def stopping(theta, action):
     return torch.cat([way, action / (9.81 * friction) + delay], 1)
 
 
-STOPPING = SimulatorModel(
-    stopping, noise=GaussianNoise(0.003), parameter_names=["friction", "delay"]
-)
+STOPPING = SimulatorModel(stopping, noise=0.003, parameter_names=["friction", "delay"])
 
 
 def trials_of(friction):
     torch.manual_seed(0)
     x = stopping(torch.stack([friction, torch.full((8,), 0.1)], 1), SPEED[:, None])
-    return Trials(
-        SPEED, x + 0.003 * torch.randn(x.shape), action_labels=["speed [m/s]"]
-    )
+    x = x + 0.003 * torch.randn(x.shape)
+    return Trials(SPEED, x, action_labels=["speed [m/s]"])
 
 
-@pytest.mark.parametrize(
-    ("friction", "verdict"),
-    [
-        (0.5 + 0.1 * (SPEED - 1.875), "friction by speed"),
-        (0.5 + 0.02 * (torch.arange(8) - 3.5), "friction by trial"),
-        (torch.full((8,), 0.5), "none"),
-    ],
-)
+#: Frictions, and the verdict.
+DEPENDING = [
+    (0.5 + 0.1 * (SPEED - 1.875), "friction by speed"),
+    (0.5 + 0.02 * (torch.arange(8) - 3.5), "friction by trial"),
+    (torch.full((8,), 0.5), "none"),
+]
+
+
+@pytest.mark.parametrize(("friction", "verdict"), DEPENDING)
 def test_what_a_parameter_depends_on_is_named(friction, verdict):
     trials = trials_of(friction)
     effects = varying_parameters(STOPPING, FRICTION, trials)
-    report = close_loop(
-        STOPPING, FRICTION, trials, effects=effects, evaluate=False, plan=False
-    )
+    given = {"effects": effects, "evaluate": False, "plan": False}
+    report = close_loop(STOPPING, FRICTION, trials, **given)
     assert report.verdict == verdict
 
 

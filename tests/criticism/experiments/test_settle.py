@@ -6,27 +6,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from sbi.utils import BoxUniform
 
-from sbi_active import DiscreteActions, GaussianNoise, SimulatorModel
+from sbi_active import DiscreteActions
 from sbi_active.criticism import Criticism, Trials, close_loop
-from sbi_active.criticism.experiments.choice import (
-    limit_of,
-    probability_of,
-    unless_unproven,
-)
+from sbi_active.criticism.experiments import choice
 from sbi_active.criticism.experiments.settle import NAME, VerdictError, settle
 from sbi_active.criticism.misfit.rule import Rule
 from tests.criticism.misfit import oscillator
+from tests.criticism.slope_world import MODEL, NOISE, PRIOR, read
 from tests.effects import added
 
 pytestmark = pytest.mark.usefixtures("few_draws")
 
-NOISE = 0.1
-PRIOR = BoxUniform(-3 * torch.ones(1), 3 * torch.ones(1))
-MODEL = SimulatorModel(
-    lambda theta, xi: theta * xi + 0 * xi, noise=GaussianNoise(NOISE)
-)
 #: Trials so far were all forward; the robot may go back as well.
 FORWARD = torch.tensor([1.0, 1.5, 2.0, 2.5, 3.0, 1.0, 2.0, 3.0])[:, None]
 BOTH = DiscreteActions([-3.0, -1.0, 1.0, 3.0])
@@ -49,7 +40,7 @@ class Robot:
         return self.read(action[None])[0]
 
     def read(self, action):
-        x = 0.7 * action + NOISE * torch.randn(action.shape, generator=self.gen)
+        x = read(0.7 * action, self.gen)
         return x if self.form is None else x + self.size * self.form(action)
 
     def trials(self):
@@ -106,9 +97,8 @@ def test_a_registered_prediction_is_that_of_linear_least_squares():
     design = torch.cat([FORWARD, FORMS["drag"](FORWARD)], 1).double()
     new = torch.tensor([float(own.action[0])]).double()
     new = torch.stack([new, FORMS["drag"](new)], 1)
-    cov = torch.linalg.inv(
-        design.T @ design / NOISE**2 + torch.diag(torch.tensor([0.0, 1.0]))
-    )
+    prior = torch.diag(torch.tensor([0.0, 1.0]))
+    cov = torch.linalg.inv(design.T @ design / NOISE**2 + prior)
     mean = new @ cov @ design.T @ trials.x.double() / NOISE**2
     sd = float((NOISE**2 + new @ cov @ new.T).sqrt())
     assert own.verdict == "drag"
@@ -146,21 +136,20 @@ def test_an_effect_is_withdrawn_by_the_rule_that_named_it():
         return replace(trial, registered=new, x=own.mean + own.sd)
 
     def after(*tested):
-        return unless_unproven(replace(report, tested=tested), remaining)
+        return choice.unless_unproven(replace(report, tested=tested), remaining)
 
     assert off(0.2).held
     for tested in ([trial], [off(0.9 * remaining)], [off(0.2), off(0.3)]):
         assert after(*tested).verdict == "lag"
     for tested in ([off(1.1 * remaining)], [off(0.2), off(0.4)]):
         assert after(*tested).verdict == "unexplained"
-    exact = replace(
-        trial, registered=replace(own, without={"lag": own.mean}), x=own.mean
-    )
+    own_exact = replace(own, without={"lag": own.mean})
+    exact = replace(trial, registered=own_exact, x=own.mean)
     assert after(exact).verdict == "unexplained"  # without it predicted as well
     found = after(replace(trial, registered=replace(own, without={})))
     assert (found.verdict, found.tracing.beside) == ("unexplained", ("lag",))
     assert found.tracing.key == report.tracing.key  # it still predicts
-    assert probability_of(found) == 0.0
+    assert choice.probability_of(found) == 0.0
     assert found.warnings[-1].code == "SA533"
     assert "unexplained" in str(found).splitlines()[0]
 
@@ -170,7 +159,7 @@ def test_nine_of_ten_further_errors_stay_below_the_limit(most, worth):
     """Whatever the numbers of a trial are worth, and whatever their size."""
     rng = np.random.default_rng(0)
     draws = 7 * rng.chisquare(worth, (600, 8)) / worth
-    below = [new <= limit_of(before, most) ** 2 for *before, new in draws]
+    below = [new <= choice.limit_of(before, most) ** 2 for *before, new in draws]
     # A prior of what a trial is worth has a share in it where few trials tell of that.
     assert 0.86 < np.mean(below) < 0.96
 

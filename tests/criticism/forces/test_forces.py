@@ -7,11 +7,12 @@ import pytest
 import torch
 from sbi.utils import BoxUniform
 
-from sbi_active import GaussianNoise, SimulatorModel
-from sbi_active.criticism import Trials
+from sbi_active import SimulatorModel
+from sbi_active.criticism import Criticism, Trials
 from sbi_active.criticism.forces import force_effects, total_force
 from sbi_active.criticism.forces.dictionary import FORMS
 from sbi_active.criticism.forces.library import trajectories
+from sbi_active.criticism.rivals import coordinates
 
 TIMES = torch.linspace(0.1, 2.0, 20, dtype=torch.float64)
 STEP, SD, MASS = 0.05, 0.003, 2.0
@@ -33,7 +34,7 @@ def swing(theta, action, *, force=None):
     return torch.stack(found, 1).to(theta.dtype)
 
 
-MODEL = SimulatorModel(swing, noise=GaussianNoise(SD), batched=True, sample_times=TIMES)
+MODEL = SimulatorModel(swing, noise=SD, sample_times=TIMES)
 
 
 @dataclass(frozen=True)
@@ -94,6 +95,50 @@ def test_a_simulator_that_never_asks_is_refused():
     def fn(theta, action, *, force=None):
         return swing(theta, action)
 
-    deaf = SimulatorModel(fn, noise=GaussianNoise(SD), sample_times=TIMES)
+    deaf = SimulatorModel(fn, noise=SD, sample_times=TIMES)
     with pytest.raises(ValueError, match="call total_force"):
         force_effects(deaf, PRIOR, measured())
+
+
+# Forces whose sign would feed energy without bound are never fitted
+
+
+@pytest.fixture(scope="module")
+def pushed():
+    """Return trials of a pendulum that something drives faster than it is damped."""
+    return measured("v|v|", 0.2)
+
+
+@pytest.fixture(scope="module")
+def forces(pushed):
+    effects = force_effects(MODEL, PRIOR, pushed, joints=["hinge"])
+    return {effect.name: effect for effect in effects}
+
+
+def test_only_what_outgrows_damping_and_drives_is_bounded(forces):
+    bounds = {k: coordinates.dissipative_bounds(e) for k, e in forces.items()}
+    for name in ("v|v| of hinge", "v^3 of hinge"):
+        low, high = bounds.pop(name)
+        assert low.tolist() == [-np.inf], name
+        assert high.tolist() == [0.0], name
+    assert not any(np.isfinite([*low, *high]).any() for low, high in bounds.values())
+
+
+KINDS = [f"{form} of hinge" for form in ("v|v|", "v", "sin 2q", "q^3")]
+
+
+@pytest.mark.parametrize("is_bounded", [True, False])
+def test_damping_that_feeds_energy_is_never_adopted(
+    is_bounded, pushed, forces, monkeypatch
+):
+    """Without the bound it is, so that these trials do speak for it."""
+    if not is_bounded:
+        everywhere = (np.full(1, -np.inf), np.full(1, np.inf))
+        monkeypatch.setattr(coordinates, "dissipative_bounds", lambda e: everywhere)
+    effects = [forces[name] for name in KINDS]
+    tracing = Criticism(MODEL, PRIOR, pushed, effects=effects).trace()
+    assert (KINDS[0] in tracing.chosen) != is_bounded
+    for evidence in tracing.evidences.values():
+        if is_bounded and KINDS[0] in evidence.names:
+            at = evidence.names.index(KINDS[0])
+            assert (evidence.draws[:, at] <= 1e-9).all()

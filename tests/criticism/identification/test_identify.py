@@ -17,7 +17,7 @@ from sbi_active.criticism.linear.mixture import integrated
 from sbi_active.criticism.linear.processes import Grams, Processes
 from sbi_active.inference.sampling.mixtures import draws_between
 from sbi_active.mujoco import randomization
-from tests.criticism.linear.linear_models import linear_model
+from tests.criticism.linear.test_errors import linear_model
 from tests.effects import autocorrelated, on_outcomes
 
 WHITE = Processes(np.ones(1), np.zeros(1), np.full(1, np.inf), np.zeros(1, bool))
@@ -121,16 +121,14 @@ def test_the_sum_over_draws_of_errors_is_that_over_all_of_them(is_known):
         v = base * np.exp(np.stack(np.meshgrid(sizes, sizes), -1).reshape(-1, 2))
         own = (gram[h, [0, 1]] / v[..., None, None]).sum(1)
         prior = np.log(np.where(np.array(h) > 0, 0.25, 0.5)) - 0.5 * log_det[h, [0, 1]]
-        log_p = (prior - 10 * np.log(v)).sum(1) + integrated(own, model, (1.0,))[0][
-            :, 0
-        ]
+        told = integrated(own, model, (1.0,))[0][:, 0]
+        log_p = (prior - 10 * np.log(v)).sum(1) + told
         log_z.append(logsumexp(log_p) + (0 if is_known else 2 * np.log(step)))
     log_p = found.log_p[0] - np.log(0.5)  # of no effect
     weight = np.exp(log_p - log_p.max())
     error = weight.std() / weight.mean() / 64
-    assert logsumexp(log_p) - np.log(4096) == pytest.approx(
-        logsumexp(log_z), abs=4 * error
-    )
+    found = logsumexp(log_p) - np.log(4096)
+    assert found == pytest.approx(logsumexp(log_z), abs=4 * error)
     assert error < 0.05
 
 
@@ -158,9 +156,8 @@ def test_draws_between_bounds_that_are_correlated_have_their_moments():
     weight /= weight.sum()
     assert ((u >= low) & (u <= high)).all()
     assert weight @ u == pytest.approx(every[inside].mean(0), abs=0.02)
-    assert np.cov(u.T, aweights=weight) == pytest.approx(
-        np.cov(every[inside].T), abs=0.03
-    )
+    inner = np.cov(every[inside].T)
+    assert np.cov(u.T, aweights=weight) == pytest.approx(inner, abs=0.03)
     alone = norm.sf(0.5) * (norm.cdf(0.7) - norm.cdf(-1.0))
     assert np.exp(log_weight).mean() * alone == pytest.approx(inside.mean(), rel=0.03)
 

@@ -6,15 +6,17 @@ import torch
 from sbi.utils import BoxUniform
 from torch.distributions import Independent, Uniform
 
-from sbi_active import GaussianNoise, SimulatorModel
+from sbi_active import SimulatorModel
 from sbi_active.criticism import Criticism, Trials
 from sbi_active.criticism.linear import screening
 from sbi_active.criticism.linear.fits import FitSettings
+from sbi_active.criticism.linear.model import centered, linearize
 from sbi_active.criticism.linear.search import Search
 from sbi_active.criticism.results import ModelKey
+from sbi_active.criticism.rivals.rival_set import RivalSet
 from sbi_active.criticism.steps import equivalence
 from sbi_active.criticism.steps.detection import log_priors
-from tests.effects import louder, on_outcomes
+from tests.effects import drift, louder, on_outcomes
 
 SENSOR, NUM_TRIALS, LIMIT, SLOPE = 0.5, 14, 14.0, 2.0
 
@@ -31,7 +33,7 @@ EFFECTS = [
         prior=Independent(Uniform(torch.tensor([0.0]), torch.tensor([4.0])), 1),
         null=torch.inf,
     ),
-    on_outcomes("drift", lambda x, phi, action, c: x + phi * c.index[:, None]),
+    drift(),
 ]
 
 
@@ -42,7 +44,7 @@ def searched(**settings):
     drift = SLOPE * torch.arange(NUM_TRIALS)[:, None]
     x = curve(theta, action).clamp(-LIMIT, LIMIT) + drift
     x = x + SENSOR * torch.randn(x.shape, generator=generator)
-    model = SimulatorModel(curve, noise=GaussianNoise(SENSOR))
+    model = SimulatorModel(curve, noise=SENSOR)
     prior = BoxUniform(-5 * torch.ones(2), 5 * torch.ones(2))
     loop = Criticism(model, prior, Trials(action, x), effects=EFFECTS, seed=0)
     search = Search(loop.rivals, FitSettings(**settings))
@@ -63,6 +65,27 @@ def test_no_pair_is_fitted_where_linear_evidence_puts_all_behind():
     search = searched(behind=-np.inf)
     search.fit_larger()
     assert max(len(key.effects) for key in search.found) == 1
+
+
+def test_slopes_are_from_both_sides_and_at_a_bound_from_within():
+    def saturating(theta, xi):
+        return torch.tanh(0.1 * xi * theta[:, :1] * theta[:, 1:])
+
+    model = SimulatorModel(saturating, noise=1e-6)
+    prior = BoxUniform(torch.tensor([1.0, 0.5]), torch.tensor([20.0, 2.0]))
+    xi, unit = torch.linspace(0.5, 1.5, 8)[:, None], np.full(8, 1e-6)
+    trials = Trials(xi, torch.tanh(0.99 * xi))
+    own = RivalSet(model, prior, trials, []).rival(ModelKey())
+    one_sided = linearize(own, own.coordinates.from_z(np.array([[9.0, 1.1]]))[0], unit)
+    models = one_sided, centered(own, one_sided, unit)
+    # What the trials tell of the direction that they tell least of, which is nothing.
+    told = [np.linalg.svd(m.jacobian, compute_uv=False)[-1] for m in models]
+    assert told[1] < 0.1 < 1 < told[0]
+    for corner in (own.coordinates.low, own.coordinates.high):
+        one_sided = linearize(own, corner, unit)
+        both = centered(own, one_sided, unit)
+        np.testing.assert_allclose(both.jacobian, one_sided.jacobian)
+        assert np.isfinite(both.jacobian).all()
 
 
 # A library of effects, all fitted, and one of one more, screened, say the same
@@ -95,7 +118,7 @@ def pattern(k):
 
 def loop_of(number, strength, *more):
     rng = np.random.default_rng(7)
-    model = SimulatorModel(series, noise=GaussianNoise(0.05))
+    model = SimulatorModel(series, noise=0.05)
     action = torch.tensor([[0.5], [1.0], [1.5]])
     x = series(torch.tensor([[0.7]]), action) + strength * torch.cos(6 * TIMES)
     x = x + 0.05 * torch.from_numpy(rng.standard_normal(x.shape)).float()

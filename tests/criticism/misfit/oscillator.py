@@ -4,7 +4,7 @@ import torch
 from torch import Tensor
 from torch.distributions import HalfNormal, Independent, Normal
 
-from sbi_active import GaussianNoise, SimulatorModel
+from sbi_active import SimulatorModel
 from sbi_active.criticism import Effect, Trials
 
 NUM_TRIALS, NUM_SAMPLES = 8, 20
@@ -36,9 +36,7 @@ def oscillate(
     return torch.stack(found, 1).to(theta.dtype)
 
 
-MODEL = SimulatorModel(
-    oscillate, noise=GaussianNoise(SENSOR), batched=True, sample_times=TIMES
-)
+MODEL = SimulatorModel(oscillate, noise=SENSOR, sample_times=TIMES)
 ACTION = torch.linspace(0.5, 2.0, NUM_TRIALS, dtype=torch.float64)[:, None]
 
 

@@ -3,16 +3,18 @@
 import numpy as np
 import pytest
 import torch
+from torch.distributions import Normal
 
-from sbi_active import GaussianNoise, SimulatorModel
-from sbi_active.criticism import Criticism, Trials, close_loop
+from sbi_active import SimulatorModel
+from sbi_active.criticism import Criticism, Effect, Trials, close_loop
 from sbi_active.criticism.linear.screening import linear_models
 from sbi_active.criticism.misfit import record
 from sbi_active.criticism.misfit.draws import spread_of
 from sbi_active.criticism.misfit.guesses import MARGIN, guess_residual
 from sbi_active.criticism.results import ModelKey
+from sbi_active.criticism.rivals.trial_simulator import TrialSimulator
 from sbi_active.criticism.steps.detection import THRESHOLD
-from sbi_active.criticism.steps.predictive import find_residuals, predict
+from sbi_active.criticism.steps.predictive import conditioned, find_residuals, predict
 from tests.criticism.misfit.oscillator import (
     ACTION,
     EFFECTS,
@@ -30,8 +32,8 @@ from tests.effects import added
 HIDDEN, LAG = 0.6, 0.3
 
 
-def loop(own, effects=EFFECTS, model=MODEL, prior=PRIOR):
-    return Criticism(model, prior, own, effects=effects, seed=0)
+def loop(own, effects=EFFECTS, model=MODEL, prior=PRIOR, **options):
+    return Criticism(model, prior, own, effects=effects, seed=0, **options)
 
 
 @pytest.fixture(scope="module")
@@ -103,7 +105,7 @@ def test_held_out_errors_are_told_number_by_number_as_left_out_ones_are():
     x = x + unit * (0.8 * action**2 + 0.4 * torch.sin(4 * action))
     x = x + 0.05 * unit * torch.randn(x.shape, generator=gen)
     own = Trials(action, x, role=["fit"] * 16 + ["held out"] * 8)
-    model = SimulatorModel(both, noise=GaussianNoise(0.05 * unit))
+    model = SimulatorModel(both, noise=0.05 * unit)
     curve = added("curve", lambda xi: xi**2 * unit)
     for found in loop(own, [curve], model, prior=WIDE).trace().misfit.models:
         held_out = found.held_out / unit.numpy()
@@ -200,3 +202,64 @@ def test_a_guess_is_the_term_that_is_missing_of_numbers_and_none_where_no_formul
     assert found[0][0] == "xi^3"
     assert min(gain for _, gain in found) > MARGIN
     assert guesses(2 * torch.sin(9 * NUMBERS)) == guesses(0 * NUMBERS) == ()
+
+
+# Start states that every trial has anew, beside an effect and an undeclared force
+
+
+NUM, NUM_HELD, FIRST = 12, 4, 7
+START = Effect.keyword("start", prior=Normal(0.0, 0.5), scope="trial")
+BESIDE = [START, *EFFECTS[2:]]
+
+
+@pytest.fixture(scope="module")
+def started():
+    rng = np.random.default_rng(1)
+    action = torch.from_numpy(rng.uniform(1, 4, (NUM + NUM_HELD, 1)))
+    start = torch.from_numpy(rng.normal(0, 0.5, NUM + NUM_HELD))
+    every = trials(action=action, lag=0.3, hidden=0.3, start=start)
+    role = ["fit"] * NUM + ["held out"] * NUM_HELD
+    own = Trials(action, every.x, sample_times=TIMES, role=role)
+    return loop(own, BESIDE, warm_up=1.25), own
+
+
+def test_the_cause_is_found_beside_start_states(started):
+    criticism, _ = started
+    assert criticism.trace().verdict == "lag"
+    evidence = criticism.trace().evidences["lag"]
+    assert evidence.effective_sample_size >= 50
+    assert evidence.draws.shape[1] == 3  # theta and lag, no start states
+
+
+def test_a_held_out_trial_tells_of_its_start_by_its_first_samples(started):
+    criticism, own = started
+    tracing, held = criticism.trace(), own.held_out
+    error = tracing.misfit.of(tracing.model).held_out[0]
+    blind = loop(own, BESIDE)
+    far = blind.trace().misfit.of(blind.trace().model).held_out[0]
+    assert error < 0.5 * far
+    # What was used to find the start is not scored.
+    p = predict(criticism.rivals, held, key=ModelKey(("lag",)))
+    assert len(p.measurements) == NUM_HELD * (20 - FIRST)
+    assert {int(i) % 20 for i in p.measurements.position} == {*range(FIRST, 20)}
+
+
+def test_start_states_are_those_of_least_squares(started):
+    """Drawn given the first samples, against a search over the start alone."""
+    criticism, own = started
+    criticism.trace()
+    rivals = criticism.rivals
+    fit = rivals.fit(ModelKey(("lag",)))
+    simulator = TrialSimulator(rivals.simulator.model, own.held_out)
+    rng = np.random.default_rng(0)
+    theta, phi = conditioned(rivals, fit, fit.sample.u[:40], simulator, rng)
+    grid = torch.linspace(-2, 2, 2001, dtype=torch.float64)
+    middle = theta.double().reshape(-1, 2).mean(0).expand(len(grid), -1)
+    for t, drawn in enumerate(phi["start"][..., 0].T.numpy()):
+        action = own.held_out.action[t].expand(len(grid), -1)
+        lag = float(phi["lag"].mean())
+        x = MODEL.fn(middle, action, start=grid, lag=lag)
+        square = ((x - own.held_out.x[t])[:, :FIRST] ** 2).sum(1)
+        best = float(grid[int(square.argmin())])
+        assert drawn.mean() == pytest.approx(best, abs=4 * drawn.std() + 0.01)
+        assert drawn.std() < 0.1

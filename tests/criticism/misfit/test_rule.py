@@ -55,6 +55,7 @@ IMITATED = {"-": (0.0, 101.0), "b": (0.0, 50.0), "c": (0.0, 50.0), "bc": (20.0, 
 RELATIVES = {"-": (0.0, 101.0), "a": (0.0, 30.0), "b": (0.0, 30.0), "c": (20.2, 4.4)}
 RELATIVES |= {"ac": (19.9, 4.0), "bc": (20.0, 4.0)}
 FEW = {"-": (0.0, 101.0), "b": (0.0, EVEN)}
+SAME = {"-": (0, 50.0), "a": (-1, 50.0), "b": (0.5, 50.0)}
 #: One trial of four tells of the effect, by a hundred times the error.
 ONCE, MILD = np.array([9.0, 9.5, 9.0, 1000.0]), np.array([9.0, 9.5, 9.0, 30.0])
 
@@ -65,12 +66,7 @@ CASES = {
     "a Bayes factor of 90": (HALVED | {"a": (4.5, 11.0, 10.0)}, True, "a", ""),
     "a sensor": ({"-": (0.0, 1e4), "a": (30.0, 1e3), "b": (1.0, 9e3)}, True, "a", "a"),
     "a finer one": ({"-": (0, 1e6), "a": (30, 1e5), "b": (1, 9e5)}, True, "a", "a"),
-    "no error less": (
-        {"-": (0, 50.0), "a": (-1, 50.0), "b": (0.5, 50.0)},
-        True,
-        "",
-        "",
-    ),
+    "no error less": (SAME, True, "", ""),
     "one trial far from the others": (FEW | {"a": (8.0, FAR)}, True, "a", None),
     "not without times": (FEW | {"a": (8.0, FAR)}, False, "b", None),
     "surely worse": (FEW | {"a": (8.0, 2 * EVEN)}, True, "b", None),
@@ -174,16 +170,17 @@ THREE |= {"ab": (20, 10.0), "ac": (10, 50.0), "bc": (10, 50.0)}
 TWO = {"-": (0.0, 101.0), "a": (20.0, 10.0), "b": (5.0, 60.0)}
 
 
-@pytest.mark.parametrize(
-    ("errors", "timed", "first"),
-    [
-        (THREE | {"abc": (24.0, 9.5)}, True, "ab"),
-        (THREE | {"abc": (25.0, 9.5)}, True, "abc"),  # decisive
-        (TWO | {"ab": (21.5, 9.5)}, False, "a"),
-        (TWO | {"ab": (21.7, 9.5)}, False, "ab"),  # five times without times
-        (TWO | {"ab": (21.5, 9.5)}, True, "ab"),
-    ],
-)
+#: Errors, whether trials have times, and what is begun with.
+FURTHER = [
+    (THREE | {"abc": (24.0, 9.5)}, True, "ab"),
+    (THREE | {"abc": (25.0, 9.5)}, True, "abc"),  # decisive
+    (TWO | {"ab": (21.5, 9.5)}, False, "a"),
+    (TWO | {"ab": (21.7, 9.5)}, False, "ab"),  # five times without times
+    (TWO | {"ab": (21.5, 9.5)}, True, "ab"),
+]
+
+
+@pytest.mark.parametrize(("errors", "timed", "first"), FURTHER)
 def test_a_further_effect_needs_evidence(errors, timed, first):
     assert compared(errors, timed).starts()[0] == ModelKey((*first,))
 

@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from sbi.utils import BoxUniform
 
-from sbi_active import DiscreteActions, GaussianNoise, SimulatorModel
+from sbi_active import DiscreteActions, SimulatorModel
 from sbi_active.criticism import Trials, close_loop, results
 from sbi_active.criticism.contradictions import Misfit, ModelError, Support
 from sbi_active.criticism.report.report import build_report
@@ -20,8 +20,7 @@ DRAG = on_outcomes(
 SHUFFLED = [2.0, -1.0, 3.0, 1.0, -2.0, -3.0, 1.5, -1.5, 2.5]
 ACTIONS = DiscreteActions(torch.linspace(-3, 3, 13), names=["speed"], units=["m/s"])
 MODEL = SimulatorModel(
-    lambda theta, xi: (theta[:, :1] + theta[:, 1:] * xi).expand(-1, 6),
-    noise=GaussianNoise(0.1),
+    lambda theta, xi: (theta[:, :1] + theta[:, 1:] * xi).expand(-1, 6), noise=0.1
 )
 
 

@@ -8,19 +8,13 @@ import torch
 from sbi.utils import BoxUniform
 from scipy.stats import chi2, norm
 
-from sbi_active import DiscreteActions, GaussianNoise, SimulatorModel
+from sbi_active import DiscreteActions, SimulatorModel
 from sbi_active.criticism import Trials, close_loop, generic_effects
 from sbi_active.criticism.report.gate import EXIT_CODES
 from tests.criticism import block
+from tests.criticism.slope_world import MODEL, NOISE, PRIOR, read
 from tests.effects import BIAS
 
-NOISE = 0.1
-PRIOR = BoxUniform(-3 * torch.ones(1), 3 * torch.ones(1))
-MODEL = SimulatorModel(
-    lambda theta, xi: theta * xi + 0 * xi,
-    noise=GaussianNoise(NOISE),
-    parameter_names=["slope"],
-)
 ACTIONS = DiscreteActions(torch.linspace(-2, 2, 9))
 
 
@@ -30,8 +24,8 @@ def decided(form, *, prior=PRIOR, fitted=9, held_out=4):
     num = fitted + held_out
     action = ACTIONS.values[torch.randperm(9, generator=gen).repeat(2)[:num]]
     mean = form(action, torch.arange(num)[:, None] < fitted)
-    x = mean + NOISE * torch.randn(mean.shape, generator=gen)
-    trials = Trials(action, x, role=["fit"] * fitted + ["held out"] * held_out)
+    role = ["fit"] * fitted + ["held out"] * held_out
+    trials = Trials(action, read(mean, gen), role=role)
     report = close_loop(MODEL, prior, trials, effects=[BIAS], plan=False)
     assert report.to_dict()["gate"] == json.loads(json.dumps(report.gate.to_dict()))
     assert report.gate.exit_code == EXIT_CODES[report.gate.decision]
@@ -63,11 +57,11 @@ CASES = {
     "a positive parameter": (
         lambda xi, fits: 0.1 * xi,
         {"prior": BoxUniform(torch.tensor([0.5]), torch.tensor([3.0]))},
-        *("OUT_OF_PRIOR", lambda own: 0 < own["box"]["slope"]["lower"] < 0.1),
+        *("OUT_OF_PRIOR", lambda own: 0 < own["box"]["theta_1"]["lower"] < 0.1),
     ),
     "a truth beyond a bound, which is to be moved": (
         lambda xi, fits: 4.0 * xi,
-        *({}, "OUT_OF_PRIOR", lambda own: 4.0 < own["box"]["slope"]["upper"] < 6.0),
+        *({}, "OUT_OF_PRIOR", lambda own: 4.0 < own["box"]["theta_1"]["upper"] < 6.0),
     ),
     "few trials": (
         lambda xi, fits: 0.7 * xi,
@@ -84,7 +78,7 @@ def test_a_decision_has_its_details(case):
     assert holds(gate.details)
     for bound in gate.details.get("bounds", ()):
         where = (bound["name"], bound["side"], bound["bound"])
-        assert where in [("slope", "upper", 3.0), ("slope", "lower", 0.5)]
+        assert where in [("theta_1", "upper", 3.0), ("theta_1", "lower", 0.5)]
     is_named = decision == "WRONG_MODEL" and gate.details.get("effects") == ["bias"]
     assert is_named == (case == "an effect is missing")
 
@@ -98,10 +92,7 @@ def test_trajectories_that_tell_a_product_alone_are_not_identifiable():
         return xi * torch.cos(rate * times.to(theta))
 
     model = SimulatorModel(
-        swing,
-        noise=GaussianNoise(1e-3),
-        parameter_names=["stiffness", "factor"],
-        sample_times=times,
+        swing, noise=1e-3, parameter_names=["stiffness", "factor"], sample_times=times
     )
     prior = BoxUniform(torch.tensor([1.0, 0.5]), torch.tensor([20.0, 2.0]))
     gen, xi = torch.Generator().manual_seed(0), torch.linspace(0.5, 1.5, 8)[:, None]
@@ -117,7 +108,7 @@ def test_trajectories_that_tell_a_product_alone_are_not_identifiable():
 
 
 def test_three_trials_of_which_one_contradicts():
-    model = SimulatorModel(block.stop, noise=GaussianNoise(block.SENSOR))
+    model = SimulatorModel(block.stop, noise=block.SENSOR)
     prior, trials = block.friction(0.1), Trials([1.0, 2.0, 3.0], [0.127, 0.510, 2.3])
     effects = generic_effects(model, trials, prior=prior)
     report = close_loop(model, prior, trials, effects=effects, plan=False)
@@ -130,7 +121,7 @@ def test_three_trials_of_which_one_contradicts():
 
 def left_out(x, noise=NOISE):
     """Return the gate of trials at actions of one, each predicted by the others."""
-    model = SimulatorModel(MODEL.fn, noise=GaussianNoise(noise))
+    model = SimulatorModel(MODEL.fn, noise=noise)
     trials = Trials(torch.ones(len(x)), x)
     return close_loop(model, PRIOR, trials, effects=[BIAS], plan=False).gate
 
@@ -179,7 +170,7 @@ def test_copies_of_trajectories_are_no_further_trials():
     times, gen = torch.linspace(0.1, 2.0, 20), torch.Generator().manual_seed(0)
     model = SimulatorModel(
         lambda theta, xi: xi * torch.exp(-theta * times),
-        noise=GaussianNoise(NOISE),
+        noise=NOISE,
         sample_times=times,
     )
     xi = torch.tensor([[3.0], [2.0], [4.0], [5.0]])
@@ -207,7 +198,7 @@ def test_a_noise_declared_too_large_hides_what_is_missing(times, ships):
 
 def test_a_parameter_whose_sign_no_trial_tells_is_not_known():
     """One sign was said to be known to a hundredth, and the gate shipped."""
-    model = SimulatorModel(lambda theta, xi: theta**2 * xi, noise=GaussianNoise(NOISE))
+    model = SimulatorModel(lambda theta, xi: theta**2 * xi, noise=NOISE)
     gen, xi = torch.Generator().manual_seed(0), torch.linspace(-2, 2, 12)[:, None]
     x = 4.0 * xi + NOISE * torch.randn(xi.shape, generator=gen)
     report = close_loop(model, PRIOR, Trials(xi, x), effects=[BIAS], plan=False)

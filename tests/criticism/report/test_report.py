@@ -13,7 +13,7 @@ from sbi_active.criticism.contradictions import SevereTest
 from sbi_active.criticism.report.sections import head
 from sbi_active.display.panels import AFTER, BEFORE, plot_residuals
 from tests.criticism.report.reports import DRAG, report, residuals, tracing
-from tests.display.parsed import Parsed
+from tests.display.browser import Parsed
 
 TESTS = (SevereTest(action=np.array([3.0]), is_permitted=True, difference=1.234),)
 
@@ -60,8 +60,8 @@ def test_markdown_tables_have_as_many_cells_as_headings():
     text = re.sub(r"\\\|", "", made.to_markdown())
     blocks = re.findall(r"(?:^\|.*\|$\n?)+", text, flags=re.MULTILINE)
     assert len(blocks) == 4
-    for block in blocks:
-        assert len({line.count("|") for line in block.splitlines()}) == 1
+    for own in blocks:
+        assert len({line.count("|") for line in own.splitlines()}) == 1
 
 
 def test_save_writes_the_page_and_every_figure(tmp_path):
@@ -105,3 +105,6 @@ def test_every_residual_is_drawn_at_its_action_its_trial_and_its_channel(num):
             expected = sorted(zip(place, made.refitted.ravel(), strict=True))
             np.testing.assert_allclose(points(ax), expected)
             assert {line.get_color() for line in ax.lines[:num]} == {color}
+
+
+# The gate: each decision on a small case made for it

@@ -7,7 +7,7 @@ import pytest
 import torch
 from sbi.utils import BoxUniform
 
-from sbi_active import GaussianNoise, SimulatorModel
+from sbi_active import SimulatorModel
 from sbi_active.criticism import Trials, close_loop, joint_prior
 from sbi_active.criticism.contradictions import (
     BoundParameter,
@@ -15,44 +15,37 @@ from sbi_active.criticism.contradictions import (
     MissedTrial,
     OutlyingTrial,
 )
-from tests.criticism.report.reports import (
-    DRAG,
-    MADE,
-    SHUFFLED,
-    report,
-    residuals,
-    tracing,
-    trials,
-)
-from tests.effects import BIAS, autocorrelated, on_outcomes
+from tests.criticism import slope_world
+from tests.criticism.report import reports
+from tests.effects import BIAS, autocorrelated, drift
 
 
 def noted(**changes):
-    return {"detection": replace(MADE.detection, **changes)}
+    return {"detection": replace(reports.MADE.detection, **changes)}
 
 
 def told(verdict="drag", **changes):
-    return {"tracing": tracing(verdict, **changes)}
+    return {"tracing": reports.tracing(verdict, **changes)}
 
 
 def with_evidence(**changes):
-    drag = replace(MADE.tracing.evidences["drag"], **changes)
-    return told(evidences=MADE.tracing.evidences | {"drag": drag})
+    drag = replace(reports.MADE.tracing.evidences["drag"], **changes)
+    return told(evidences=reports.MADE.tracing.evidences | {"drag": drag})
 
 
 def with_noise(kind):
-    return {"residuals": replace(residuals(size=6.0), noise=kind)}
+    return {"residuals": replace(reports.residuals(size=6.0), noise=kind)}
 
 
 def smooth(correlation, times=None, *, known=0.0):
     """Return residuals along 40 samples with an autocorrelated error."""
     z = autocorrelated(np.random.default_rng(0).normal(size=(8, 40)), correlation)
-    made = replace(residuals((40,), times=times), refitted=z, correlation=known)
+    made = replace(reports.residuals((40,), times=times), refitted=z, correlation=known)
     return {"residuals": made, "residuals_after": made}
 
 
 def outcomes(lost, probability):
-    made = residuals()
+    made = reports.residuals()
     x = made.x.copy()
     x[lost] = np.nan
     found = replace(made, x=x, probability_valid=np.array(probability))
@@ -63,20 +56,20 @@ def repeated(share):
     """Return residuals along 40 samples, a share of whose variance is that of all."""
     drawn = np.random.default_rng(0).normal(size=(9, 40))
     z = share**0.5 * drawn[:1] + (1 - share) ** 0.5 * drawn[1:]
-    made = replace(residuals((40,), times=np.arange(40.0)), refitted=z)
+    made = replace(reports.residuals((40,), times=np.arange(40.0)), refitted=z)
     return {"residuals": made, "residuals_after": made}
 
 
 def jumps(size):
-    made = residuals()
+    made = reports.residuals()
     found = replace(made, roughness=None if size is None else np.full((8, 6), size))
     return {"residuals": found, "residuals_after": found}
 
 
 def pushed(mean, hook="observation"):
     """Return a report whose drag lies so many prior deviations from its null."""
-    effect = replace(DRAG, hook=hook, family=hook)
-    evidence = MADE.tracing.evidences["drag"]
+    effect = replace(reports.DRAG, hook=hook, family=hook)
+    evidence = reports.MADE.tracing.evidences["drag"]
     draws = evidence.draws.copy()
     draws[:, -1] += mean - draws[:, -1].mean()
     prior = joint_prior(BoxUniform(torch.zeros(2), torch.ones(2)), [effect])
@@ -84,16 +77,16 @@ def pushed(mean, hook="observation"):
 
 
 def errors(after):
-    table = MADE.evaluation.table.copy()
+    table = reports.MADE.evaluation.table.copy()
     table.loc[table["metric"] == "rmse", ["before", "after"]] = 1.0, after
-    return {"evaluation": replace(MADE.evaluation, table=table)}
+    return {"evaluation": replace(reports.MADE.evaluation, table=table)}
 
 
 def growing(rate):
-    made = residuals(num=9)
+    made = reports.residuals(num=9)
     z = made.refitted * np.exp(rate * np.arange(9))[:, None]
     grown = replace(made, refitted=z, x=2 + z)
-    own = trials(SHUFFLED)
+    own = reports.trials(reports.SHUFFLED)
     return {"residuals": grown, "residuals_after": grown, "trials": own}
 
 
@@ -109,14 +102,17 @@ MISSED = MissedTrial(position=0, name="7", size=60.0, p_value=0.0, by_both=True)
 ASIDE = OutlyingTrial(position=3, name="3", times=9.0, size=50.0)
 BOUND = BoundParameter(name="mu_1", model="none", side="lower", bound=0.5, beyond=0.4)
 WEAK = {"log_bayes_factor": 1.0, "p_value": 1e-9}
-SORTED = trials(sorted(trials().action[:, 0].tolist()))
+SORTED = reports.trials(sorted(reports.trials().action[:, 0].tolist()))
 NEARLY = [2.0, -1.0, 3.0, 1.0, -2.0]
 
 #: By code, and words where it has two kinds: a report that deserves it, and one that
 #: comes near.
 CASES = {
     "SA501": (with_noise("estimated"), with_noise("declared")),
-    "SA502": ({"trials": trials(NEARLY[:4])}, {"trials": trials(NEARLY)}),
+    "SA502": (
+        {"trials": reports.trials(NEARLY[:4])},
+        {"trials": reports.trials(NEARLY)},
+    ),
     "SA503": (
         {"trials": SORTED},
         {"trials": Trials(SORTED.action, SORTED.x, order="unknown")},
@@ -138,7 +134,7 @@ CASES = {
         told(),
     ),
     "SA513": (told(set_aside=(ASIDE,)), told()),
-    "SA514": ({"evaluation": replace(MADE.evaluation, missed=(MISSED,))}, {}),
+    "SA514": ({"evaluation": replace(reports.MADE.evaluation, missed=(MISSED,))}, {}),
     "SA515": (pushed(3.0), pushed(2.0)),
     "SA516": (pushed(3.0), pushed(3.0, "dynamics")),
     "SA518": (told("unexplained"), told("scatter")),
@@ -165,26 +161,20 @@ def test_each_caution_has_its_case(kind):
         return [w for w in made.warnings if w.code == code and words in w]
 
     deserved, near = CASES[kind]
-    made = report(**deserved)
+    made = reports.report(**deserved)
     (sentence,) = said(made)
     text = sentence.removesuffix(f" ({code})")
     assert f"- {code} {text}" in " ".join(str(made).split())
-    assert not said(report(**near))
-    assert report().warnings == ()  # of a right model
+    assert not said(reports.report(**near))
+    assert reports.report().warnings == ()  # of a right model
 
 
 def test_trials_of_unknown_order_drift_nowhere():
-    def drifting(x, phi, action, context):
-        return x + phi * context.index[:, None]
-
-    drift = on_outcomes("drift", drifting, 0.1, needs_order=True)
-    action = torch.linspace(-2, 2, 16)[:, None].double()
-    x = action + 0.8
-    x = x + 0.1 * torch.randn(x.shape, generator=torch.manual_seed(1)).double()
-    model = SimulatorModel(lambda theta, xi: theta * xi, noise=GaussianNoise(0.1))
-    prior = BoxUniform(-3 * torch.ones(1), 3 * torch.ones(1))
-    own = Trials(action, x, order="unknown")
-    made = close_loop(model, prior, own, effects=[BIAS, drift], evaluate=False)
+    action = torch.linspace(-2, 2, 16)[:, None]
+    own = Trials(action, slope_world.read(action + 0.8, 1), order="unknown")
+    effects = [BIAS, drift(0.1, needs_order=True)]
+    given = slope_world.MODEL, slope_world.PRIOR, own
+    made = close_loop(*given, effects=effects, evaluate=False)
     assert "SA526" in [w.code for w in made.warnings]
     assert "drift" not in made.probabilities
     assert made.verdict == "bias"

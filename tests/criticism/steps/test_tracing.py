@@ -127,9 +127,8 @@ def test_a_name_may_contain_what_joins_names():
     x = world.measured(curve=0.5, kink=0.6)
     shapes = world.rivals(x).effects
     renamed = [replace(e, name=f"{n} + {n} lag") for n, e in shapes.items()]
-    some = RivalSet(
-        world.rivals(x).model, world.PRIOR, Trials(world.ACTION, x), renamed
-    )
+    trials = Trials(world.ACTION, x)
+    some = RivalSet(world.rivals(x).model, world.PRIOR, trials, renamed)
     tracing, _ = traced(world.judged(some), None)
     assert tracing.chosen == ("curve + curve lag", "kink + kink lag")
     assert tracing.model == "curve + curve lag + kink + kink lag"
@@ -168,9 +167,8 @@ def check_scores(scores, own, mean, sd):
     """Compare scores with those of normal predictions of one number."""
     density = norm(mean, sd).logpdf(own)
     np.testing.assert_allclose(scores["rmse"], np.abs(own - mean), atol=0.02)
-    np.testing.assert_allclose(
-        scores["log predictive density"], density, rtol=0.2, atol=0.1
-    )
+    found = scores["log predictive density"]
+    np.testing.assert_allclose(found, density, rtol=0.2, atol=0.1)
     crps = norm_crps(own, mean, sd)
     np.testing.assert_allclose(scores["energy score"], crps, atol=0.02)
     assert (scores["coverage"] != (np.abs(own - mean) < 1.645 * sd)).sum() <= 1
@@ -200,9 +198,8 @@ def test_errors_of_some_trials_are_those_of_a_verdict_on_them():
     """A smooth function of the action is one of them; without it scatter took over."""
     x, keep = world.measured(curve=0.1), np.arange(12) != 4
     whole = world.judged(world.rivals(x)).states.joint(ModelKey(), keep)
-    part = world.judged(world.rivals(x[keep], action=world.ACTION[keep])).states.joint(
-        ModelKey()
-    )
+    less = world.judged(world.rivals(x[keep], action=world.ACTION[keep]))
+    part = less.states.joint(ModelKey())
     assert [*whole] == [*part]
     for key, log_p in part.items():
         assert whole[key] == pytest.approx(log_p, abs=0.3), key
@@ -215,9 +212,8 @@ def test_residuals_are_standardized_by_the_normal_predictive(fitted, names):
     own = X[:, 0].double().numpy()
     np.testing.assert_allclose(made.mean[:, 0], mean, atol=0.02)
     np.testing.assert_allclose(made.sd[:, 0], sd, rtol=0.1)
-    np.testing.assert_allclose(
-        made.refitted[:, 0], (own - made.mean[:, 0]) / made.sd[:, 0], rtol=1e-6
-    )
+    expected = (own - made.mean[:, 0]) / made.sd[:, 0]
+    np.testing.assert_allclose(made.refitted[:, 0], expected, rtol=1e-6)
     assert made.noise == "declared"
     assert made.correlation == 0
 

@@ -5,9 +5,8 @@ import math
 import pytest
 import torch
 from sbi.utils import BoxUniform
-from torch.distributions import Distribution
 
-from sbi_active import DiscreteActions, InformationGainDesigner, SimulatorModel
+from sbi_active import InformationGainDesigner, SimulatorModel
 from sbi_active.design import LikelihoodGain, LinearGain, PosteriorGain, RatioGain
 from sbi_active.design.estimators.automatic import choose_estimator, find_estimator
 from sbi_active.design.estimators.base import CandidateSimulations
@@ -18,39 +17,40 @@ from tests.linear_gaussian import (
     ExactLikelihood,
     ExactLikelihoodAndPosterior,
     ExactRatio,
+    candidates,
     information,
 )
 
-GAUSSIAN = torch.distributions.Normal(0.0, 1.0)
 NEAR, FAR = torch.tensor([[0.5], [1.0]]), torch.tensor([[0.5], [40.0]])  # 7.4 nats
 
 
-def rows(actions=NEAR, n=512, noise: Distribution = GAUSSIAN, pairs=False):
-    theta = PRIOR.sample((n,))
-    x, again = (actions[:, None] * theta + noise.sample((2, n, 2)) for _ in "ab")
-    return CandidateSimulations(theta, actions, x, replicate=again if pairs else None)
+def heavy(mean):
+    return torch.distributions.StudentT(3.0).sample(mean.shape)
 
 
-def unusable(actions=NEAR, n=512):
+def unusable(actions=NEAR):
     """Noise from heavy-tailed pairs, which fails the test of normality."""
-    return rows(actions, n, torch.distributions.StudentT(3.0), pairs=True)
+    return candidates(actions, 512, noise=heavy, pairs=True)
 
 
-@pytest.mark.parametrize(
-    ("model", "estimator"),
-    [
-        (ExactLikelihoodAndPosterior(), PosteriorGain),
-        (ExactLikelihood(), LikelihoodGain),
-        (ExactRatio(), InfoNCEGain),
-        (None, "EntropyGain"),
-    ],
-)
+#: Models, and the estimator by what they can say.
+SAYING = [
+    (ExactLikelihoodAndPosterior(), PosteriorGain),
+    (ExactLikelihood(), LikelihoodGain),
+    (ExactRatio(), InfoNCEGain),
+    (None, "EntropyGain"),
+]
+
+
+@pytest.mark.parametrize(("model", "estimator"), SAYING)
 def test_what_the_model_can_say_is_used_where_the_noise_cannot(model, estimator):
     chosen, notes = choose_estimator(model, unusable(), PRIOR)
     assert "noise is not Gaussian" in notes[0]
     if model is None:
         assert notes[-1] == "used all the same: there is no model"
-        estimator = type(choose_estimator(None, rows(pairs=True), PRIOR)[0])
+        estimator = type(
+            choose_estimator(None, candidates(NEAR, 512, pairs=True), PRIOR)[0]
+        )
     assert type(chosen) is estimator
 
 
@@ -78,16 +78,17 @@ def test_a_ratio_beyond_the_reach_of_info_nce_is_averaged():
     assert "at 1 of 2 actions" in notes[-1]
 
 
-@pytest.mark.parametrize(
-    ("estimator", "text"),
-    [
-        (InfoNCEGain(num_contrastive=63), "near its largest value, log K = 4.2"),
-        (LikelihoodGain(num_contrastive=64), "near log L = 4.2 nats or above"),
-    ],
-)
+#: Estimators, and what is said of their estimate.
+LIMITED = [
+    (InfoNCEGain(num_contrastive=63), "near its largest value, log K = 4.2"),
+    (LikelihoodGain(num_contrastive=64), "near log L = 4.2 nats or above"),
+]
+
+
+@pytest.mark.parametrize(("estimator", "text"), LIMITED)
 def test_an_estimate_near_its_limit_is_said_to_be(estimator, text):
     model = ExactLikelihood()
-    far, near = rows(FAR), rows(NEAR)
+    far, near = candidates(FAR, 512), candidates(NEAR, 512)
     gain = estimator(model, far, PRIOR)
     notes = estimator.cautions(gain)
     assert len(notes) == 1
@@ -101,7 +102,7 @@ def test_an_estimate_near_its_limit_is_said_to_be(estimator, text):
 
 
 def test_a_ratio_whose_normalization_is_off_is_noticed():
-    simulations = rows()
+    simulations = candidates(NEAR, 512)
     for offset, expected in ((0.0, 0), (1.0, 1)):
         given = ExactRatio(offset=offset), simulations, PRIOR
         notes = RatioGain().compared(*given, RatioGain()(*given))
@@ -110,13 +111,14 @@ def test_a_ratio_whose_normalization_is_off_is_noticed():
     assert "nats below" in notes[0]
 
 
-@pytest.mark.parametrize(
-    ("former", "name", "kind"),
-    [
-        ("variational_nested", "likelihood", LikelihoodGain),
-        ("contrastive", "info_nce", InfoNCEGain),
-    ],
-)
+#: Former names, names, and estimators.
+FORMER = [
+    ("variational_nested", "likelihood", LikelihoodGain),
+    ("contrastive", "info_nce", InfoNCEGain),
+]
+
+
+@pytest.mark.parametrize(("former", "name", "kind"), FORMER)
 def test_a_former_name_is_taken_for_one_version(former, name, kind):
     with pytest.warns(DeprecationWarning, match=f'use estimator="{name}"'):
         assert type(find_estimator(former)) is kind
@@ -127,7 +129,7 @@ def on_steps(num, dim):
     prior = BoxUniform(torch.zeros(dim), torch.ones(dim))
     noise = GaussianNoise(0.05)
     stairs = SimulatorModel(lambda theta, action: (num * theta).floor(), noise=noise)
-    designer = InformationGainDesigner(DiscreteActions([0.0, 1.0]), num_samples=750)
+    designer = InformationGainDesigner([0.0, 1.0], num_samples=750)
     return designer.select(None, stairs, belief=prior, seed=0)
 
 

@@ -10,28 +10,28 @@ import pytest
 import torch
 
 from sbi_active.design import LikelihoodGain, RatioGain
-from sbi_active.design.estimators.base import CandidateSimulations, standard_error
+from sbi_active.design.estimators.base import standard_error
 from sbi_active.design.estimators.contrast import InfoNCEGain
-from tests.design.fragile import PRIOR as FRAGILE_PRIOR
-from tests.design.fragile import Fragile, log_normal
-from tests.linear_gaussian import PRIOR, ExactLikelihood, ExactRatio, information
+from tests.design.test_outcomes import PRIOR as FRAGILE_PRIOR
+from tests.design.test_outcomes import Fragile, log_normal
+from tests.linear_gaussian import (
+    PRIOR,
+    ExactLikelihood,
+    ExactRatio,
+    candidates,
+    information,
+)
 
 ACTIONS = torch.tensor([[0.0], [0.5], [1.0], [2.0]])
 EXACT = information(ACTIONS)
 FAR = torch.tensor([[20.0]])  # 6 nats
+ROWS, FAR_ROWS = candidates(ACTIONS, 512), candidates(FAR, 512)
 ESTIMATORS = {
     "likelihood": (LikelihoodGain(num_contrastive=500), ExactLikelihood()),
     "info_nce, ratio": (InfoNCEGain(num_contrastive=255), ExactRatio()),
     "info_nce, likelihood": (InfoNCEGain(num_contrastive=255), ExactLikelihood()),
     "ratio": (RatioGain(), ExactRatio()),
 }
-
-
-def rows(actions=ACTIONS, n=512, seed=0):
-    generator = torch.Generator().manual_seed(seed)
-    theta = torch.randn(n, 2, generator=generator)
-    noise = torch.randn(len(actions), n, 2, generator=generator)
-    return CandidateSimulations(theta, actions, actions[:, None] * theta + noise)
 
 
 def estimate(estimator, model, simulations, belief=PRIOR):
@@ -42,17 +42,17 @@ def estimate(estimator, model, simulations, belief=PRIOR):
 @pytest.mark.parametrize("name", ESTIMATORS)
 def test_the_closed_form(name):
     estimator, model = ESTIMATORS[name]
-    gain, error = estimate(estimator, model, rows())
+    gain, error = estimate(estimator, model, ROWS)
     assert ((gain - EXACT).abs() <= 3 * error + 1e-6).all()
     assert (error < 0.1).all()
 
 
 def test_bounds_are_where_they_claim_to_be():
     """Six nats are too many for 100 draws."""
-    simulations, exact, model = rows(FAR), float(information(FAR)), ExactLikelihood()
-    upper, error = estimate(LikelihoodGain(num_contrastive=100), model, simulations)
+    exact, model = float(information(FAR)), ExactLikelihood()
+    upper, error = estimate(LikelihoodGain(num_contrastive=100), model, FAR_ROWS)
     assert float(upper) > exact + 3 * float(error)
-    gain, error = estimate(InfoNCEGain(), model, simulations)
+    gain, error = estimate(InfoNCEGain(), model, FAR_ROWS)
     assert float(gain) < exact - 3 * float(error)
     assert InfoNCEGain().bound_on(model) == "lower"
 
@@ -64,34 +64,33 @@ def test_a_wrong_likelihood_is_wrong(spread):
     It is below the information by the divergence of the implied posterior; with few
     draws it is above: no bound on either side.
     """
-    model = ExactLikelihood(spread)
-    simulations, a = rows(), ACTIONS[:, 0].double()
-    gain, error = estimate(LikelihoodGain(num_contrastive=2_000), model, simulations)
+    model, a = ExactLikelihood(spread), ACTIONS[:, 0].double()
+    gain, error = estimate(LikelihoodGain(num_contrastive=2_000), model, ROWS)
     wide = a**2 + spread**2
     own = -1 / spread**2 - 2 * math.log(spread)
     wrong = own + (a**2 + 1) / wide + wide.log()
     assert ((gain - wrong).abs() <= 3 * error + 0.02)[:3].all()
     assert (gain < EXACT - 3 * error)[1:].all()
-    few, error = estimate(LikelihoodGain(num_contrastive=20), model, rows(FAR))
+    few, error = estimate(LikelihoodGain(num_contrastive=20), model, FAR_ROWS)
     assert float(few) > float(information(FAR) + 3 * error)
     # a bound for any likelihood stays below for all that
-    gain, error = estimate(InfoNCEGain(), model, simulations)
+    gain, error = estimate(InfoNCEGain(), model, ROWS)
     assert (gain < EXACT + 3 * error + 1e-6).all()
     assert float(gain[-1]) < float(EXACT[-1] - 3 * error[-1])
 
 
 def test_a_wrong_ratio_is_wrong_but_for_info_nce():
     """Off by a function of x, its mean is above; InfoNCE does not see it."""
-    simulations, model = rows(), ExactRatio(offset=0.5)
-    gain, error = estimate(RatioGain(), model, simulations)
+    model = ExactRatio(offset=0.5)
+    gain, error = estimate(RatioGain(), model, ROWS)
     assert (gain > EXACT + 3 * error).all()
-    blind = InfoNCEGain()(model, simulations, PRIOR)
-    assert torch.allclose(blind, InfoNCEGain()(ExactRatio(), simulations, PRIOR))
+    blind = InfoNCEGain()(model, ROWS, PRIOR)
+    assert torch.allclose(blind, InfoNCEGain()(ExactRatio(), ROWS, PRIOR))
     # a steep ratio fools the mean, and only loosens the bound
     steep = ExactRatio(power=1.8)
-    gain, error = estimate(RatioGain(), steep, simulations)
+    gain, error = estimate(RatioGain(), steep, ROWS)
     assert (gain > EXACT + 3 * error)[1:].all()
-    gain, error = estimate(InfoNCEGain(), steep, simulations)
+    gain, error = estimate(InfoNCEGain(), steep, ROWS)
     assert (gain < EXACT + 3 * error + 1e-6).all()
 
 

@@ -6,25 +6,16 @@ from dataclasses import replace
 import pytest
 import torch
 
-from sbi_active.design import (
-    EntropyGain,
-    LikelihoodGain,
-    LinearGain,
-    NestedGain,
-    PosteriorGain,
-    RatioGain,
-)
-from sbi_active.design.estimators.base import CandidateSimulations
+from sbi_active import design
 from sbi_active.design.estimators.contrast import InfoNCEGain
 from sbi_active.design.estimators.emulator import MeanEmulator
-from sbi_active.simulation import GaussianNoise
 from tests.linear_gaussian import (
     PRIOR,
     ExactLikelihoodAndPosterior,
     ExactModel,
     ExactRatio,
+    candidates,
     information,
-    simulator,
 )
 
 ACTIONS = torch.tensor([[0.0], [0.5], [2.0]])
@@ -39,13 +30,13 @@ class Everything(ExactLikelihoodAndPosterior, ExactRatio):
 
 
 ESTIMATORS = {
-    "entropy": EntropyGain(),
+    "entropy": design.EntropyGain(),
     "info_nce": InfoNCEGain(num_contrastive=31),
-    "likelihood": LikelihoodGain(num_contrastive=50),
-    "linear": LinearGain(),
-    "nested": NestedGain(),
-    "posterior": PosteriorGain(),
-    "ratio": RatioGain(),
+    "likelihood": design.LikelihoodGain(num_contrastive=50),
+    "linear": design.LinearGain(),
+    "nested": design.NestedGain(),
+    "posterior": design.PosteriorGain(),
+    "ratio": design.RatioGain(),
 }
 DRAWING = {"entropy", "nested"}  # other numbers in turn
 FROM_MODELS = sorted(set(ESTIMATORS) - {"entropy", "linear", "nested"})
@@ -53,10 +44,7 @@ FROM_MODELS = sorted(set(ESTIMATORS) - {"entropy", "linear", "nested"})
 
 @pytest.fixture
 def rows():
-    theta = torch.randn(128, 2)
-    mean = ACTIONS[:, None] * theta
-    x = mean + torch.randn_like(theta)
-    return CandidateSimulations(theta, ACTIONS, x, mean, GaussianNoise(1.0))
+    return candidates(ACTIONS, 128, declared=1.0)
 
 
 @pytest.mark.parametrize("name", ESTIMATORS)
@@ -119,17 +107,11 @@ def test_a_model_that_cannot_say_is_an_error(name, rows):
 # Gains by a posterior that is exact, too wide, or has no density
 
 
-def simulations(n=4_000):
-    theta, action = torch.randn(n, 2), torch.tensor([[0.0], [1.0], [2.0]])
-    x = torch.stack([simulator(theta, a.expand(n, 1)) for a in action])
-    return CandidateSimulations(theta, action, x)
-
-
 @pytest.mark.parametrize("spread", [1.0, 2.0])
 def test_a_model_of_the_wrong_spread_loses_what_the_divergence_says(spread):
     """E U = I - KL(N(m, s) || N(m, (k s)^2)) in each of two dimensions."""
-    rows = simulations()
-    gain = PosteriorGain()(ExactModel(spread=spread), rows, PRIOR)
+    rows = candidates(ACTIONS, 4_000)
+    gain = design.PosteriorGain()(ExactModel(spread=spread), rows, PRIOR)
     loss = 2 * (math.log(spread) + 0.5 / spread**2 - 0.5)
     error = gain.std(1) / gain.shape[1] ** 0.5
     distance = (gain.mean(1) - (information(rows.action) - loss)).abs()
@@ -142,7 +124,7 @@ def test_outcomes_without_a_density_are_not_left_out_of_the_mean():
             return torch.where(theta[:, 0] > 0, torch.nan, theta[:, 0])
 
     with pytest.raises(ValueError, match=r"densities of Overflows; got NaN at"):
-        PosteriorGain()(Overflows(), simulations(n=64), PRIOR)
+        design.PosteriorGain()(Overflows(), candidates(ACTIONS, 64), PRIOR)
 
 
 # Interpolated noise-free outcomes

@@ -47,8 +47,7 @@ LASTING_INVERSE = (0.01 * torch.exp(-(TIMES[:, None] - TIMES).abs() / 0.3)).inve
 
 
 @pytest.mark.parametrize(
-    ("noise", "inverse"),
-    [(GaussianNoise(0.1), INVERSE), (LASTING, LASTING_INVERSE)],
+    ("noise", "inverse"), [(GaussianNoise(0.1), INVERSE), (LASTING, LASTING_INVERSE)]
 )
 def test_it_is_exact_where_outcomes_are_linear(noise, inverse):
     gain = LinearGain()(None, linear_case(noise), BELIEF)

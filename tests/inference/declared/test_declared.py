@@ -12,7 +12,7 @@ from scipy.stats import norm
 from torch import Tensor
 from torch.distributions import Independent, LogNormal, Normal
 
-from sbi_active import Campaign, DiscreteActions, GaussianNoise, SimulatorModel
+from sbi_active import Campaign, SimulatorModel
 from sbi_active.inference import RefinementOptions, refine
 from sbi_active.inference.declared.refining import SimulatedBelief
 from sbi_active.inference.engine import SimulatedPotential, search
@@ -38,12 +38,12 @@ def drawn(theta, action):
     return line(theta, action) + SD * torch.randn_like(theta)
 
 
-DECLARED = SimulatorModel(line, noise=GaussianNoise(SD))
+DECLARED = SimulatorModel(line, noise=SD)
 
 
 def after(trials, simulator=DECLARED, method="nsbi"):
     given = {"method": method, "options": OPTIONS}
-    c = Campaign(simulator, PRIOR, DiscreteActions([0.5, 1.0, 3.0]), **given)
+    c = Campaign(simulator, PRIOR, [0.5, 1.0, 3.0], **given)
     for action, x in trials:
         c.tell(x, action=[action])
     c.update()
@@ -114,7 +114,7 @@ def test_uninformed_parameters_keep_their_prior():
         return theta[:, :known] @ weight.T
 
     prior = Independent(LogNormal(torch.zeros(dim), 0.4 * torch.ones(dim)), 1)
-    simulator = SimulatorModel(mean, noise=GaussianNoise(0.5))
+    simulator = SimulatorModel(mean, noise=0.5)
     x = mean(torch.ones(1, dim), action)
     belief = refine(simulator, prior, action, x, seed=0)
     assert isinstance(belief, SimulatedBelief)
@@ -156,7 +156,7 @@ def test_an_earlier_belief_finds_the_way_back_between_jumps():
         jump = torch.sin(12_345 * torch.floor(theta / 1e-3)) * (theta.abs() > 5e-4)
         return torch.cat([theta + jump, 2 * theta - jump**2], 1)
 
-    table = MeanTable(SimulatorModel(jagged, noise=GaussianNoise(1e-3)), IN_PROCESS)
+    table = MeanTable(SimulatorModel(jagged, noise=1e-3), IN_PROCESS)
     x = torch.zeros(1, 2, dtype=torch.float64)
     likelihood = SimulatedLikelihood(table, torch.zeros(1, 1), x)
     rng = np.random.default_rng(0)
@@ -185,7 +185,7 @@ def test_a_prior_far_from_the_trials_is_weighed(off: float):
         return theta.repeat_interleave(num, 1) / math.sqrt(num)
 
     prior = Independent(Normal(torch.zeros(dim), 1.0), 1)
-    simulator = SimulatorModel(repeated, noise=GaussianNoise(1.0))
+    simulator = SimulatorModel(repeated, noise=1.0)
     belief = refine(simulator, prior, torch.zeros(1, 1), x, seed=0)
     peak = x.reshape(dim, num).sum(1) / math.sqrt(num)
     with forked_generators(0):
@@ -209,7 +209,7 @@ def test_bounds_cut_a_posterior_along_thirty_axes():
         return theta[:, ::2] + theta[:, 1::2]
 
     prior = BoxUniform(torch.zeros(2 * pairs), torch.ones(2 * pairs))
-    simulator = SimulatorModel(sums, noise=GaussianNoise(sd))
+    simulator = SimulatorModel(sums, noise=sd)
     belief = refine(simulator, prior, torch.zeros(1, 1), x, seed=0)
     with forked_generators(0):
         theta = belief.sample((4_000,)).double().numpy()
@@ -254,7 +254,7 @@ def observe(model: SimulatorModel, seed: int) -> Tensor:
 
 
 def test_noise_stays_inflated_after_a_further_trial():
-    model = SimulatorModel(smooth, noise=GaussianNoise(FINE))
+    model = SimulatorModel(smooth, noise=FINE)
     x = observe(model, 0)
     apart = torch.cat([x[:1], x[:1] + 100 * FINE, x[1:]])
     action = ACTION[[0, 0, 1, 2]]
@@ -268,7 +268,7 @@ def test_noise_stays_inflated_after_a_further_trial():
 
 def test_rows_of_earlier_trials_are_not_simulated_again():
     """Draws of the prior that a search looks at are the same after a further trial."""
-    model = SimulatorModel(smooth, noise=GaussianNoise(FINE))
+    model = SimulatorModel(smooth, noise=FINE)
     x = observe(model, 0)
     first = refine(model, BOX, ACTION[:2], x[:2], settings=FEW, seed=0)
     assert isinstance(first, SimulatedBelief)
@@ -282,7 +282,7 @@ def test_rows_of_earlier_trials_are_not_simulated_again():
 
 
 def test_the_caller_s_arrays_are_copied():
-    model = SimulatorModel(smooth, noise=GaussianNoise(FINE))
+    model = SimulatorModel(smooth, noise=FINE)
     action, x = ACTION.clone(), observe(model, 0)
     belief = refine(model, BOX, action, x, settings=FEW, seed=0)
     theta = BOX.sample((20,))

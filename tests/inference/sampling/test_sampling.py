@@ -11,16 +11,9 @@ from scipy.optimize import nnls
 from scipy.stats import multivariate_normal, multivariate_t, norm, truncnorm
 
 from sbi_active.inference.networks.mixture_density import Adam
+from sbi_active.inference.sampling import mixtures
 from sbi_active.inference.sampling.gaussian_process import GaussianProcess
 from sbi_active.inference.sampling.least_squares import within
-from sbi_active.inference.sampling.mixtures import (
-    StudentMixture,
-    eigh,
-    fitted_normals,
-    log_inside,
-    lower_factors,
-    truncated_normal,
-)
 from sbi_active.inference.sampling.smc import bridge
 from sbi_active.inference.sampling.weights import systematic
 
@@ -60,7 +53,7 @@ def never_converges(monkeypatch):
 @pytest.mark.parametrize("shape", [(6, 6), (2, 3, 6, 6)])
 def test_robust_representations_take_over(never_converges, shape):
     a = symmetric(*shape)
-    values, vectors = eigh(a)
+    values, vectors = mixtures.eigh(a)
     assert values.shape == shape[:-1]
     assert (np.diff(values) >= 0).all()
     again = (vectors * values[..., None, :]) @ np.swapaxes(vectors, -1, -2)
@@ -68,14 +61,6 @@ def test_robust_representations_take_over(never_converges, shape):
 
 
 # Gaussian mixtures fitted to points
-
-
-def test_mixture_handles_repeated_points():
-    rng = np.random.default_rng(0)
-    points = np.repeat(rng.standard_normal((3, 2)), 100, axis=0)
-    mixture = fitted_normals(points, 6, rng)
-    assert np.isfinite(mixture.factors).all()
-    assert len(np.unique(mixture.log_parts(points).argmax(0))) <= 3
 
 
 def test_no_component_lies_across_two_thin_modes():
@@ -88,7 +73,10 @@ def test_no_component_lies_across_two_thin_modes():
             rng.normal(size=(1_000, 2)),
         )
         points = np.stack([mode + 1e-4 * apart[:, 0], apart[:, 1]], 1)
-        assert fitted_normals(points, 4, rng).log_prob(points).mean() > exact - 0.2
+        assert (
+            mixtures.fitted_normals(points, 4, rng).log_prob(points).mean()
+            > exact - 0.2
+        )
 
 
 # Gaussian processes on few simulations
@@ -143,9 +131,9 @@ def density(weights: np.ndarray) -> np.ndarray:
 
 
 def test_the_density_is_scipy_s():
-    mixture = StudentMixture(MEANS, FACTORS, WEIGHTS)
+    mixture = mixtures.StudentMixture(MEANS, FACTORS, WEIGHTS)
     assert mixture.log_prob(Z) == pytest.approx(np.log(density(WEIGHTS)))
-    even = StudentMixture(MEANS, FACTORS)
+    even = mixtures.StudentMixture(MEANS, FACTORS)
     assert even.log_prob(Z) == pytest.approx(np.log(density(np.full(2, 0.5))))
 
 
@@ -153,8 +141,8 @@ def test_a_split_mixture_is_normalized_and_matches_its_draws():
     rng = np.random.default_rng(0)
     axes = FACTORS @ np.array([[0.8, -0.6], [0.6, 0.8]])
     left, right = np.array([[1.0, 1.0], [2.0, 1.0]]), np.array([[3.0, 1.0], [1.0, 0.5]])
-    split = StudentMixture(MEANS, axes, WEIGHTS, 7.0, left, right)
-    wide = StudentMixture(MEANS, 4 * FACTORS, WEIGHTS)
+    split = mixtures.StudentMixture(MEANS, axes, WEIGHTS, 7.0, left, right)
+    wide = mixtures.StudentMixture(MEANS, 4 * FACTORS, WEIGHTS)
     z = wide.sample(200_000, rng)
     ratio = np.exp(split.log_prob(z) - wide.log_prob(z))
     error = ratio.std() / len(z) ** 0.5
@@ -168,9 +156,9 @@ def test_a_split_mixture_is_normalized_and_matches_its_draws():
 def test_a_singular_covariance_has_its_smallest_variances_raised():
     covariance = np.array([[1.0, 1.0], [1.0, 1.0]])[None] - 1e-16
     covariance = np.concatenate([covariance, [[[1.0, 2.0], [2.0, 1.0]]]])
-    factor = lower_factors(covariance)
+    factor = mixtures.lower_factors(covariance)
     assert (np.triu(factor, 1) == 0).all()
-    assert (np.diagonal(factor, axis1=1, axis2=2) > 0).all()
+    assert (np.diagonal(factor, axis1=1, axis2=2) > 1e-7).all()
     product = factor @ np.swapaxes(factor, 1, 2)
     assert product[0] == pytest.approx(covariance[0], abs=1e-9)
 
@@ -185,7 +173,7 @@ def standard(u):
 def mixture(*means, sd=1.0):
     means = np.array(means, dtype=float)
     factors = np.stack([sd * np.eye(means.shape[1])] * len(means))
-    return StudentMixture(means, factors, freedom=np.inf)
+    return mixtures.StudentMixture(means, factors, freedom=np.inf)
 
 
 def test_two_modes_keep_their_masses():
@@ -219,8 +207,8 @@ HIGH = np.array([2.0, 8.0, -6.0, np.inf, np.inf])
 def test_probability_between_bounds():
     one = np.ones(5)
     expected = np.log(norm.sf((LOW - 1) / 2) - norm.sf((HIGH - 1) / 2))
-    assert log_inside(one, 2 * one, LOW, HIGH) == pytest.approx(expected)
-    far = log_inside(one[:1], one[:1], np.array([31.0]), np.array([41.0]))
+    assert mixtures.log_inside(one, 2 * one, LOW, HIGH) == pytest.approx(expected)
+    far = mixtures.log_inside(one[:1], one[:1], np.array([31.0]), np.array([41.0]))
     assert far[0] == pytest.approx(norm.logsf(30.0))
 
 
@@ -228,7 +216,9 @@ def test_draws_between_bounds():
     rng = np.random.default_rng(0)
     for low, high in zip(LOW, HIGH, strict=True):
         ends = np.full(4_000, low), np.full(4_000, high)
-        draws = truncated_normal(np.ones(4_000), np.full(4_000, 2.0), *ends, rng)
+        draws = mixtures.truncated_normal(
+            np.ones(4_000), np.full(4_000, 2.0), *ends, rng
+        )
         own = truncnorm((low - 1) / 2, (high - 1) / 2, 1, 2)
         assert (low <= draws).all()
         assert (draws <= high).all()

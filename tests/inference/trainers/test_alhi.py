@@ -17,16 +17,10 @@ from sbi_active.inference.models.factors import Product, trained_region
 from sbi_active.inference.networks.ratio_network import RatioClassifier
 from sbi_active.inference.rounds.rows import Observation
 from sbi_active.inference.sampling.coordinates import PriorCoordinates
-from tests.linear_gaussian import (
-    DIM,
-    PRIOR,
-    divergence,
-    moments,
-    posterior,
-    simulator,
-)
+from tests.linear_gaussian import DIM, PRIOR, divergence, moments, posterior, simulator
 
 SETTINGS = MixtureDensity(hidden_features=(16,), num_iterations=100)
+BOX = BoxUniform(-torch.ones(1), torch.ones(1))
 ACTION, X = torch.tensor([[1.0], [3.0]]), torch.tensor([[0.7, -0.4], [1.5, -2.0]])
 
 
@@ -35,9 +29,9 @@ def rows(n=1_500, prior=PRIOR):
     return theta, simulator(theta, action), action
 
 
-def trained():
-    inference = ALHI(PRIOR, SETTINGS, show_progress_bars=False)
-    theta, x, action = rows()
+def trained(make=ALHI, data=None, prior=PRIOR, network=SETTINGS, **options):
+    inference = make(prior, network, show_progress_bars=False, **options)
+    theta, x, action = rows() if data is None else data
     inference.append_simulations(theta, x, action=action).train()
     return inference
 
@@ -88,12 +82,10 @@ def test_where_no_network_was_trained_there_is_no_likelihood():
 
 @pytest.mark.parametrize("posterior", ["importance", "kde"])
 def test_a_belief_is_a_normalized_distribution_that_pickles(posterior):
-    box = BoxUniform(-torch.ones(1), torch.ones(1))
     torch.manual_seed(0)
-    inference = ALHI(box, SETTINGS, show_progress_bars=False, posterior=posterior)
-    theta, action = box.sample((1_000,)), torch.rand(1_000, 1)
-    x = theta * action + 0.1 * torch.randn(1_000, 1)
-    inference.append_simulations(theta, x, action=action).train()
+    theta, action = BOX.sample((1_000,)), torch.rand(1_000, 1)
+    data = theta, theta * action + 0.1 * torch.randn(1_000, 1), action
+    inference = trained(data=data, prior=BOX, posterior=posterior)
     belief = inference.update(torch.tensor([0.9]), action=torch.ones(1), seed=0)
     grid = torch.linspace(-1, 1, 1_001)[:, None]
     total = float(belief.log_prob(grid).exp().double().mean()) * 2
@@ -115,12 +107,9 @@ def falls(theta, action):
 
 
 def test_no_measurement_is_information():
-    box = BoxUniform(-torch.ones(1), torch.ones(1))
     torch.manual_seed(0)
-    inference = ALHI(box, SETTINGS, show_progress_bars=False)
-    theta, action = box.sample((1_500,)), torch.rand(1_500, 1)
-    x = falls(theta, action)
-    inference.append_simulations(theta, x, action=action).train()
+    theta, action = BOX.sample((1_500,)), torch.rand(1_500, 1)
+    inference = trained(data=(theta, falls(theta, action), action), prior=BOX)
     model = inference.build_posterior()
     drawn = model.sample(torch.tensor([[0.9]]).expand(500, 1), torch.zeros(1))
     assert float(drawn.isnan().double().mean()) > 0.95
@@ -128,9 +117,8 @@ def test_no_measurement_is_information():
     share = float((belief.sample((2_000,)) > 0.5).double().mean())
     assert share > 0.9
     # The same outcome where none was ever missing tells nothing.
-    inference = ALHI(box, SETTINGS, show_progress_bars=False)
-    theta = box.sample((500,))
-    inference.append_simulations(theta, theta + 0.1, action=torch.ones(1)).train()
+    theta = BOX.sample((500,))
+    inference = trained(data=(theta, theta + 0.1, torch.ones(1)), prior=BOX)
     belief = inference.update(torch.tensor([torch.nan]), action=torch.ones(1), seed=0)
     assert abs(float(belief.mean)) < 0.1
     assert float(belief.variance) == pytest.approx(1 / 3, rel=0.1)
@@ -233,9 +221,8 @@ def test_seqbed_weighs_particles():
 
 def test_amortized_ratios_meet_the_closed_form():
     classifier = RatioClassifier(hidden_features=(32,), num_iterations=100)
-    inference = SeqBED(PRIOR, classifier, show_progress_bars=False)
-    theta, x, action = rows(2_000)
-    inference.append_simulations(theta, x, action=action).train()
+    theta, x, action = data = rows(2_000)
+    inference = trained(SeqBED, data, network=classifier)
     model = inference.build_posterior()
     with torch.no_grad():
         error = model.log_ratio(theta, x, action) - log_ratio(theta, x, action)

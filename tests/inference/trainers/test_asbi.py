@@ -164,9 +164,8 @@ def test_truncated_proposals_of_the_belief_pass_and_others_do_not():
     inference = trained(QUICK, prior=BOX)
     packed = inference.build_posterior().packed()
     packed.set_default_x(torch.tensor([[0.0, 0.0, 1.0]]))
-    restricted = RestrictedPrior(
-        BOX, get_density_thresholder(packed, num_samples_to_estimate_support=10_000)
-    )
+    region = get_density_thresholder(packed, num_samples_to_estimate_support=10_000)
+    restricted = RestrictedPrior(BOX, region)
     inference.append_simulations(theta, x, proposal=restricted, action=action)
     with pytest.raises(ValueError, match="expected proposal to be the belief"):
         inference.append_simulations(theta, x, proposal=packed, action=action)
@@ -284,15 +283,16 @@ class _Network:
         return self.normal.log_prob(theta)
 
 
-@pytest.mark.parametrize(
-    ("network", "kind"),
-    [
-        (_Network(6.0), "under-confident"),
-        (_Network(0.2), "overconfident"),
-        (_Network(1.0, shift=1.0), "misplaced"),
-        (_Network(1.1), None),
-    ],
-)
+#: Networks, and what they are.
+NETWORKS = [
+    (_Network(6.0), "under-confident"),
+    (_Network(0.2), "overconfident"),
+    (_Network(1.0, shift=1.0), "misplaced"),
+    (_Network(1.1), None),
+]
+
+
+@pytest.mark.parametrize(("network", "kind"), NETWORKS)
 def test_a_blunt_and_an_overconfident_network_are_told_apart(network, kind):
     """Blunt by a factor 6 in two dimensions: 2 log 6 = 3.6 nats of entropy."""
     belief = ASBI(PRIOR).update_all(TRIALS, simulator, refinement=REFINEMENT, seed=0)

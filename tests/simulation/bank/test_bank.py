@@ -2,13 +2,16 @@ import os
 import signal
 import time
 import traceback
+import warnings
 
 import pytest
 import torch
+from sbi.utils import BoxUniform
+from torch.distributions import Independent, Normal
 
 from sbi_active import Bank, simulate
 from sbi_active.seeding import row_normals
-from sbi_active.simulation import Simulations
+from sbi_active.simulation import Simulations, reuse
 from sbi_active.simulation.bank import LockedError
 from sbi_active.simulation.bank import bank as module
 from tests.simulation.bank.filled import append
@@ -61,7 +64,8 @@ def test_what_is_stored_is_not_simulated_again(tmp_path, num):
 def test_rows_by_position_slice_and_mask(bank, monkeypatch):
     monkeypatch.setattr(module, "SEGMENT_BYTES", 45 * 60)  # about 60 rows a segment
     rows = simulate(simulator, *draw(200), seed=0)
-    append(bank, rows, 0)
+    for _ in range(2):  # rows that are stored already are left as they are
+        append(bank, rows, 0)
     assert len(bank._segments()) > 2
     some = torch.tensor([199, 3, 3, 70])
     assert torch.equal(bank.read(some).theta, rows.theta[some])
@@ -244,3 +248,82 @@ class forked:  # noqa: N801
         if kind is not None and self():
             os.kill(self.pid, signal.SIGKILL)
         assert kind or self.join() in (0, -signal.SIGKILL)
+
+
+# Rows that are weighted for another belief
+
+
+NOISE = 0.3
+
+
+def noisy(theta, action, seeds):
+    return theta + action + NOISE * row_normals(seeds, 1).float()
+
+
+def normal(mean, sd):
+    return Independent(Normal(torch.tensor([mean]), torch.tensor([sd])), 1)
+
+
+PRIOR, ROUND = normal(0.0, 2.0), normal(3.0, 1.0)
+TARGET = normal(1.0, 0.5)
+
+
+@pytest.fixture
+def both(tmp_path):
+    """Rows of both proposals, at two actions."""
+    with Bank(tmp_path / "both", simulator=noisy) as both:
+        for proposal in (PRIOR, ROUND):
+            theta = proposal.sample((2_000,))
+            action = torch.randint(2, (2_000, 1)).float()
+            store = both.drawn_from(proposal)
+            simulate(noisy, theta, action, seed=0, store=store)
+        yield both
+
+
+def z_score(values, weights, exact):
+    """Return the error of a weighted mean in its own standard errors."""
+    mean = (weights * values).sum()
+    error = (weights**2 * (values - mean) ** 2).sum().sqrt()
+    return float((mean - exact) / error)
+
+
+def test_weighted_rows_have_the_law_of_the_target(both):
+    reused = reuse(both, TARGET)
+    rows = reused.simulations()
+    theta, weights = rows.theta[:, 0].double(), reused.weights
+    assert float(weights.sum()) == pytest.approx(1)
+    assert len(reused) == 4_000
+    assert abs(z_score(theta, weights, 1.0)) < 4
+    assert abs(z_score((theta - 1) ** 2, weights, 0.25)) < 4
+    for action in (0.0, 1.0):
+        some = rows.action[:, 0] == action
+        w = weights[some] / weights[some].sum()
+        x = rows.x[some, 0].double()
+        assert abs(z_score(x, w, 1 + action)) < 4
+        assert abs(z_score((x - 1 - action) ** 2, w, 0.25 + NOISE**2)) < 4
+    # Negative control: the same rows, unweighted.
+    equal = torch.full_like(weights, 1 / len(weights))
+    assert abs(z_score(theta, equal, 1.0)) > 10
+
+
+def test_few_effective_rows_are_told(both):
+    far = normal(-7.5, 0.3)
+    with pytest.warns(UserWarning, match=r"4000 rows of the bank are worth \d+\.\d"):
+        reused = reuse(both, far)
+    assert reused.effective_sample_size < 50
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        reuse(both, TARGET)
+
+
+def test_a_target_elsewhere(both):
+    far = BoxUniform(torch.tensor([50.0]), torch.tensor([51.0]))
+    with pytest.raises(ValueError, match="got 4000 rows, all of density 0; simulate"):
+        reuse(both, far)
+    empty = Bank(both.path.parent / "empty", simulator=noisy)
+    with pytest.raises(ValueError, match=r"expected rows in .*; got none"):
+        reuse(empty, TARGET)
+    with empty:
+        append(empty, both.read(slice(0, 9)), 0)
+        with pytest.raises(ValueError, match="got none whose proposal is known"):
+            reuse(empty, TARGET)

@@ -3,11 +3,13 @@ import os
 import resource
 import shutil
 import subprocess
+from functools import partial
 
+import numpy as np
 import pytest
 import torch
 
-from sbi_active import Bank, simulate
+from sbi_active import Bank, SimulatorModel, simulate
 from sbi_active.seeding import row_normals
 from sbi_active.simulation import Simulations
 from sbi_active.simulation.fingerprint import fingerprint, require_same
@@ -18,13 +20,12 @@ def simulator(theta, action, seeds):
     return theta + row_normals(seeds, 2).float()
 
 
-class Robot:
-    def __init__(self, mass):
-        self.mass = mass
-        self._cache = object()
+class Rail:
+    def __init__(self, setting):
+        self.setting, self._cache = setting, object()
 
     def __call__(self, theta, action):
-        return theta * self.mass
+        return theta
 
 
 def rows(num_rows=100):
@@ -41,11 +42,11 @@ def bank(tmp_path):
 
 def test_a_bank_of_another_simulator(tmp_path):
     for seed in range(2):
-        with Bank(tmp_path / "bank", simulator=Robot(1.0)) as bank:
+        with Bank(tmp_path / "bank", simulator=Rail(1.0)) as bank:
             append(bank, rows(), seed)
-    text = "got another: .*simulator.mass 1.0 there, 2.0 here.*; give the one"
+    text = "got another: .*simulator.setting 1.0 there, 2.0 here.*; give the one"
     with pytest.raises(ValueError, match=text):
-        Bank(tmp_path / "bank", simulator=Robot(2.0))
+        Bank(tmp_path / "bank", simulator=Rail(2.0))
 
 
 def test_version_stands_for_the_source(tmp_path):
@@ -66,6 +67,57 @@ def test_version_stands_for_the_source(tmp_path):
     require_same("it", old_version, fingerprint(after, version="1"))
     with pytest.raises(ValueError, match="another: version '1' there, '2' here;"):
         require_same("it", old_version, fingerprint(after, version="2"))
+
+
+def made(scale, power=2):
+    def scaled(theta, action, shift=0.0):
+        return scale * theta**power + shift
+
+    return scaled
+
+
+#: What makes a simulator, and two settings of it.
+SETTINGS = [
+    (Rail, np.float32(1.0), np.float32(2.0)),
+    (Rail, {"ice"}, {"ice", "steel"}),
+    (Rail, 1j, 2j),
+    (Rail, b"a", b"b"),
+    (Rail, torch.ones(2).bfloat16(), torch.zeros(2).bfloat16()),
+    (made, 2.0, 3.0),
+    (partial(made, 2.0), 2, 3),
+]
+
+
+@pytest.mark.parametrize(("make", "one", "other"), SETTINGS)
+def test_settings_and_captured_variables_of_any_kind_are_seen(make, one, other):
+    before = fingerprint(make(one))
+    require_same("it", before, fingerprint(make(one)))
+    text = "another: simulator.setting " if make is Rail else "got another"
+    with pytest.raises(ValueError, match=text):
+        require_same("it", before, fingerprint(make(other)))
+
+
+@pytest.mark.parametrize("of", [lambda f: f, Rail, lambda f: Rail(f).__call__])
+def test_defaults_partial_functions_and_methods(of):
+    def pushed(theta, action, force=1.0):
+        return theta
+
+    whole, part = of(pushed), of(partial(pushed, force=2.0))
+    before = [fingerprint(simulator) for simulator in (whole, part)]
+    for k, value in enumerate((whole, part)):
+        require_same("it", before[k], fingerprint(value))
+    other = of(partial(pushed, force=3.0))
+    pushed.__defaults__ = (1.5,)
+    for k, value in enumerate((whole, other)):
+        with pytest.raises(ValueError, match="got another"):
+            require_same("it", before[k], fingerprint(value))
+
+
+def test_source_of_the_library_changes_from_release_to_release():
+    model = SimulatorModel(Rail(1.0))
+    before = fingerprint(model)
+    before["simulator"]["source"] = "that of another release"
+    require_same("it", before, fingerprint(model))
 
 
 def test_other_formats_and_folders(bank, tmp_path):

@@ -74,14 +74,15 @@ def kill_after(num_rows, seconds, path, num_workers):
     return reported, child.exitcode == -signal.SIGKILL
 
 
-@pytest.mark.parametrize(
-    ("num_moments", "seed", "num_workers"),
-    [
-        (3, 0, 1),
-        pytest.param(10, 1, 1, marks=pytest.mark.slow),
-        pytest.param(4, 2, 2, marks=pytest.mark.slow),
-    ],
-)
+#: Moments, a seed, and workers.
+KILLS = [
+    (3, 0, 1),
+    pytest.param(10, 1, 1, marks=pytest.mark.slow),
+    pytest.param(4, 2, 2, marks=pytest.mark.slow),
+]
+
+
+@pytest.mark.parametrize(("num_moments", "seed", "num_workers"), KILLS)
 def test_sigkill_loses_nothing_that_was_reported(
     num_moments, seed, num_workers, tmp_path, monkeypatch, capfd
 ):

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import torch
 
-from sbi_active import GaussianNoise, SimulatorModel, simulate
+from sbi_active import SimulatorModel, simulate
 from sbi_active.seeding import row_normals
 from sbi_active.simulation import Outcome, SimulationInterrupted, Workers
 from sbi_active.simulation.workers.schedule import Pace, pace_of
@@ -42,8 +42,8 @@ SIMULATORS = [
     global_torch,
     global_numpy,
     seeded,
-    SimulatorModel(product, noise=GaussianNoise(1.0)),
-    SimulatorModel(global_torch, noise=GaussianNoise(1.0)),
+    SimulatorModel(product, noise=1.0),
+    SimulatorModel(global_torch, noise=1.0),
 ]
 
 
@@ -111,7 +111,7 @@ def test_setup_is_no_part_of_the_time_limit():
     def fn(theta, action, *, context):
         return theta * context
 
-    model = SimulatorModel(fn, setup=slow_setup, noise=GaussianNoise(0.0))
+    model = SimulatorModel(fn, setup=slow_setup, noise=0.0)
     theta = torch.rand(3, 1)
     x = simulate(model, theta, theta, seed=0, workers=Workers(time_limit=0.1)).x
     assert torch.equal(x, theta * 2)

@@ -203,13 +203,14 @@ def raising():
     raise Stop("no licence")
 
 
-@pytest.mark.parametrize(
-    ("end", "text"),
-    [
-        (raising, r"(?s)in simulator.*no licence\s*$"),
-        (lambda: os._exit(3), "ended with code 3 during the call"),
-    ],
-)
+#: What ends a call, and what is told of it.
+ENDS = [
+    (raising, r"(?s)in simulator.*no licence\s*$"),
+    (lambda: os._exit(3), "ended with code 3 during the call"),
+]
+
+
+@pytest.mark.parametrize(("end", "text"), ENDS)
 def test_whatever_ends_a_call_in_a_worker_is_told(end, text):
     def simulator(theta, action, seeds):
         if (theta == 1).any():
@@ -223,13 +224,14 @@ def test_whatever_ends_a_call_in_a_worker_is_told(end, text):
     assert torch.equal(rows.x[rows.valid], expected[rows.valid])
 
 
-@pytest.mark.parametrize(
-    ("setup", "text"),
-    [
-        (raising, r"(?s)can load; got.*no licence"),
-        (lambda: time.sleep(60), "no answer within 0.5 s"),
-    ],
-)
+#: What is no setup, and what is said of it.
+LOADS = [
+    (raising, r"(?s)can load; got.*no licence"),
+    (lambda: time.sleep(60), "no answer within 0.5 s"),
+]
+
+
+@pytest.mark.parametrize(("setup", "text"), LOADS)
 def test_a_simulator_that_does_not_load_is_an_error_that_says_why(
     setup, text, monkeypatch
 ):

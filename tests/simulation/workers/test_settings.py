@@ -11,7 +11,7 @@ from attrs import evolve
 
 from sbi_active import CampaignOptions, MixtureDensity, simulate
 from sbi_active.campaign.options import CampaignDetails, StopRules
-from sbi_active.campaign.storage.codec import decode, encode, made
+from sbi_active.campaign.storage.codec import decode, encode
 from sbi_active.inference import LFIRE, RefinementOptions
 from sbi_active.inference.networks.mixture_density import MixtureDetails
 from sbi_active.inference.networks.ratio_network import RatioClassifier
@@ -59,20 +59,21 @@ def test_former_options_of_a_campaign_are_taken_for_one_version():
     assert loaded == options
 
 
-@pytest.mark.parametrize(
-    ("options", "name"),
-    [
-        (Workers(2, 9.0), "num_worker"),
-        (StopRules(max_sd=[1, 2]), "max_sds"),
-        (CampaignDetails(look_ahead=1), "num_score"),
-        (RefinementOptions(num_histories=500), "num_history"),
-        (RatioClassifier(hidden_features=(8,)), "hidden_feature"),
-        (LFIRE(num_marginal=50), "num_marginals"),
-        (CampaignOptions(workers=3), "num_sample"),
-        (MixtureDensity.faithful(), "num_iteration"),
-        (MixtureDetails(batch_size=7), "batch_sizes"),
-    ],
-)
+#: Options, and a name that is mistyped.
+VALUES = [
+    (Workers(2, 9.0), "num_worker"),
+    (StopRules(max_sd=[1, 2]), "max_sds"),
+    (CampaignDetails(look_ahead=1), "num_score"),
+    (RefinementOptions(num_histories=500), "num_history"),
+    (RatioClassifier(hidden_features=(8,)), "hidden_feature"),
+    (LFIRE(num_marginal=50), "num_marginals"),
+    (CampaignOptions(workers=3), "num_sample"),
+    (MixtureDensity.faithful(), "num_iteration"),
+    (MixtureDetails(batch_size=7), "batch_sizes"),
+]
+
+
+@pytest.mark.parametrize(("options", "name"), VALUES)
 def test_options_are_values(options, name):
     kind = type(options)
     same = [
@@ -96,11 +97,6 @@ def eval_of(options):
     kinds = (Workers, StopRules, CampaignDetails, RefinementOptions, CampaignOptions)
     networks = (RatioClassifier, LFIRE, MixtureDensity, MixtureDetails)
     return eval(repr(options), {kind.__name__: kind for kind in (*kinds, *networks)})
-
-
-def test_what_was_stored_before_an_option_came_has_its_default():
-    name = "sbi_active.campaign.options:CampaignDetails"
-    assert made(name, {"num_scored": 200}) == CampaignDetails(num_scored=200)
 
 
 STOPS = {"stop": 3}

@@ -132,16 +132,17 @@ if __name__ == "__main__":
 """
 
 
-@pytest.mark.parametrize(
-    "way",
-    [
-        "kill",
-        pytest.param("group", marks=pytest.mark.slow),
-        pytest.param("nest", marks=pytest.mark.slow),
-        pytest.param("end", marks=pytest.mark.slow),
-        pytest.param("forked", marks=pytest.mark.slow),
-    ],
-)
+#: How the parent ends.
+WAYS = [
+    "kill",
+    pytest.param("group", marks=pytest.mark.slow),
+    pytest.param("nest", marks=pytest.mark.slow),
+    pytest.param("end", marks=pytest.mark.slow),
+    pytest.param("forked", marks=pytest.mark.slow),
+]
+
+
+@pytest.mark.parametrize("way", WAYS)
 def test_workers_die_with_their_parent_and_silently(way, tmp_path):
     script = tmp_path / "script.py"
     script.write_text(SCRIPT)
@@ -241,16 +242,17 @@ time.sleep(0.5)
 SLOW = pytest.mark.slow
 
 
+#: What a script goes on with.
+RESTS = [
+    pytest.param(FORKED, id="forked"),
+    pytest.param(THREADS, id="threads", marks=SLOW),
+    pytest.param(NESTED, id="nested", marks=SLOW),
+    pytest.param(LEFT, id="left", marks=SLOW),
+]
+
+
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="forks")
-@pytest.mark.parametrize(
-    "rest",
-    [
-        pytest.param(FORKED, id="forked"),
-        pytest.param(THREADS, id="threads", marks=SLOW),
-        pytest.param(NESTED, id="nested", marks=SLOW),
-        pytest.param(LEFT, id="left", marks=SLOW),
-    ],
-)
+@pytest.mark.parametrize("rest", RESTS)
 @pytest.mark.parametrize("way", ["file", pytest.param("input", marks=SLOW)])
 def test_workers_run_no_script_again_and_end_silently(way, rest, tmp_path):
     script = tmp_path / "script.py"
