@@ -14,6 +14,7 @@ from sbi_active.actions import DiscreteActions, SignalActions
 from sbi_active.actions.waveforms import step
 from sbi_active.campaign import Campaign, CampaignOptions, StopRules
 from sbi_active.campaign.options import CampaignDetails
+from sbi_active.inference.trainers import base
 from sbi_active.messages import RenamedWarning
 from sbi_active.simulation import SimulatorModel
 from tests.campaign.problem import ACTIONS, OPTIONS, PRIOR, campaign, draws, noisy
@@ -256,3 +257,20 @@ def test_what_is_said_outlives_the_process(tmp_path):
     assert repr(loaded) == "Campaign(asbi, 1 trials)"  # nothing was read yet
     assert loaded.belief.diagnostics.combinations == said  # pyright: ignore
     assert repr(loaded) == f"Campaign(asbi, 1 trials; {said})"
+
+
+def test_a_search_begins_where_the_belief_before_the_trial_was(monkeypatch):
+    """From the prior it missed a mode between jumps: a right simulator was blamed."""
+    refine, started = base.refine, []
+
+    def seen(*args, start, **kwargs):
+        started.append([*start])
+        return refine(*args, start=start, **kwargs)
+
+    monkeypatch.setattr(base, "refine", seen)
+    c = Campaign(FORCE, BOX, PUSHES, options=CampaignOptions(network="on demand"))
+    beliefs = []
+    for push in (2.0, 1.0):
+        c.attach([push], [push * 0.5 * 0.7])
+        beliefs.append(c.update())
+    assert started == [[], beliefs[:1]]

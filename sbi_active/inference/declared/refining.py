@@ -129,8 +129,10 @@ class SimulatedBelief(WeightedBelief):
         self._fitted = fitted_normals(u, 4, rng)
 
     def _drawn(self, num: int, rng: np.random.Generator) -> Array:
-        # Resampled: a further likelihood would cost a simulation a trial.
-        z = self._z[rng.choice(len(self._z), size=num, p=self._weight)]
+        # Resampled: a further likelihood would cost a simulation a trial. None comes
+        # again before its weight asks for it.
+        rows = systematic(self._weight, num, rng.random())
+        z = self._z[rng.permutation(rows)]
         if not self.free.any():
             return z
         return np.where(self.free, self._coordinates.sample_prior(num, rng), z)

@@ -20,6 +20,7 @@ from sbi_active.inference.beliefs.belief import (
     named,
 )
 from sbi_active.inference.beliefs.priors import require_support
+from sbi_active.inference.declared.refining import SimulatedBelief
 from sbi_active.inference.declared.settings import RefinementOptions
 from sbi_active.inference.emulation.refining import refine
 from sbi_active.inference.engine.learned import LearnedBelief
@@ -206,7 +207,7 @@ class ActiveInference(ABC):
         # A belief of a network can be wrong; the refined one before the trial holds the
         # posterior, if only it is wide enough.
         start = [] if learned is None else [learned]
-        if isinstance(previous, LearnedBelief):
+        if isinstance(previous, LearnedBelief | SimulatedBelief):
             start.append(previous)
         belief = refine(
             simulator,

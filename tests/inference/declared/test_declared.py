@@ -281,6 +281,21 @@ def test_rows_of_earlier_trials_are_not_simulated_again():
     assert bool(((second.mean - anew.mean).abs() < 0.2 * sd).all())
 
 
+def test_as_many_draws_as_count_are_different_ones():
+    # A classifier told a thousand from exact ones, where a third came again, in .63.
+    task, actions = get_task("numerical"), torch.tensor([[-5.0], [5.0]])
+    x = torch.stack([task.real_system(action, seed=0) for action in actions])
+    belief = refine(task.simulator, task.prior, actions, x, seed=0)
+    num = int(belief.diagnostics.effective_sample_size) // 2
+    with forked_generators(0):
+        draws = belief.sample((num,))
+    assert len(draws.unique(dim=0)) > 0.95 * num
+    exact = task.reference(actions, x).sample(10_000, seed=0)
+    off = (draws.mean(0) - exact.mean(0)) / exact.std(0)
+    assert float(off.abs().max()) < 3 * num**-0.5
+    assert not bool((draws[:-1] == draws[1:]).any())  # nor in their order
+
+
 def test_the_caller_s_arrays_are_copied():
     model = SimulatorModel(smooth, noise=FINE)
     action, x = ACTION.clone(), observe(model, 0)
