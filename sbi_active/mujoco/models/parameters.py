@@ -116,7 +116,7 @@ def bounded(model: Any, parameters: Mapping[str, Any]) -> tuple[Bounded, ...]:
     require(bool(parameters), "at least one parameter", "none", advice)
     found = []
     for name, given in parameters.items():
-        is_pair = isinstance(given, Sequence) and len(given) in (2, 3)
+        is_pair = np.shape(given) in ((2,), (3,))
         require(is_pair, f"(low, high) of parameter {name!r}", given, advice)
         low, high, what = given if len(given) == 3 else (*given, name)
         low, high = float(low), float(high)

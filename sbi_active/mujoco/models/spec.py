@@ -70,8 +70,8 @@ class Source:
             self._text = given
         else:
             self._path = Path(given).resolve()
-            got = f"none at {self._path}"
-            require(self._path.is_file(), "an MJCF file", got, "check the path")
+            is_there, got = self._path.is_file(), f"none at {self._path}"
+            require(is_there, "an MJCF file", got, "check the path")
         self.compile()
         if self._spec is not None:
             self._text, self._assets = self._spec.to_xml(), dict(self._spec.assets)
