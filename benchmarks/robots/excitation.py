@@ -12,12 +12,13 @@ half of the prior, encoders with white noise of 1 mrad at 50 Hz.
 *Chirps* are those of common practice: every joint sweeps from 0.1 to 10 Hz in 20 s, all
 at once, three times over (60 s), with the largest amplitude that keeps the limits of
 position, speed and torque at parameters of the prior.
-*Chosen*: three signals of 6.6 s, one after the other. Each is the best of some 150 by
-the Gauss-Newton information under the belief of that time, the first under the prior:
-100 random ones (a chirp or a multisine for each joint, about centers of their own) and
-52 plain ones, in which all joints do the same in one of 13 bands; with the drives'
-gains as they are or a quarter of that, and as large as the same limits permit. Asked
-for are the parameters whose deviations are not yet at most those of the chirps.
+*Chosen*: signals of 2.4, 8.7 and 8.7 s, one after the other: what the first tells is
+enough for the limits to permit larger ones. Each is the best of some 150 by the
+Gauss-Newton information under the belief of that time, the first under the prior: 100
+random ones (a chirp or a multisine for each joint, about centers of their own) and 52
+plain ones, in which all joints do the same in one of 13 bands; with the drives' gains
+as they are or a quarter of that, and as large as the same limits permit. Asked for are
+the parameters whose deviations are not yet at most those of the chirps.
 *Random* takes the first of such a pool in a random order. Four draws of the belief say
 what the limits permit; the signal that is played is made smaller until it keeps them,
 less a margin of 3 %, at 1,000 draws. Every belief is that of ``identify`` from the
@@ -47,7 +48,7 @@ from benchmarks.robots.machines import go2_leg
 from benchmarks.robots.models import ARM
 from benchmarks.robots.signals import SHARE, Played, largest, plain
 from benchmarks.rows import benchmark, column, grouped
-from sbi_active import DiscreteActions, InformationGainDesigner, MixedActions
+from sbi_active import DiscreteActions, InformationGainDesigner
 from sbi_active.actions import SignalActions
 from sbi_active.criticism import Trials, identify
 from sbi_active.display.table import Table
@@ -59,7 +60,7 @@ from sbi_active.seeding import derive_seed, forked_generators, row_seeds
 RESULT = Path(__file__).parent / "results" / "excitation.csv"
 
 NOISE, RATE, GRID = 0.001, 50.0, 200.0  # rad; Hz of encoders and of goals
-SWEEP, SWEEPS, LENGTH, NUM_CHOSEN = 20.0, 3, 6.6, 3  # s
+SWEEP, SWEEPS, LENGTHS = 20.0, 3, (2.4, 8.7, 8.7)  # s
 NUM_DRAWN, NUM_SAMPLES = 100, 64
 FEW, MANY, MARGIN = 4, 1_000, 0.97  # draws that a pool and a signal have to keep
 SOFT = 0.25  # of a drive's stiffness, in the second model
@@ -209,25 +210,28 @@ def permitted_pool(name: str, robot: Robot, belief: Any, seed: int) -> Tensor:
         return pool[torch.randperm(len(pool))]
 
 
-def recorded(robot: Robot, action: Tensor, theta: Tensor, seed: int) -> Trials:
-    """Return trials of a simulated robot."""
-    assert isinstance(robot.actions, MixedActions)
-    mean = robot.simulator.mean(theta.expand(len(action), -1), action).double()
-    noise = robot.simulator.noise
-    assert noise is not None
-    x = noise.sample(mean, row_seeds(seed, len(mean)))
+def recorded(parts: Sequence[tuple[Any, Tensor]], theta: Tensor, seed: int) -> Trials:
+    """Return trials of simulated robots, each of which played some actions."""
+    each = enumerate(len(action) for _, action in parts)
+    seeds = torch.cat([row_seeds(derive_seed(seed, k), num) for k, num in each])
+    trials = [(robot, own) for robot, action in parts for own in action.split(1)]
+    inputs = [robot.actions.inputs(own.double()) for robot, own in trials]
+    x = [
+        robot.simulator.noise.sample(robot.simulator.mean(theta, own).double(), rows)[0]
+        for (robot, own), rows in zip(trials, seeds.split(1), strict=True)
+    ]
     return Trials(
-        action,
+        torch.cat([own for _, own in trials]),
         x,
-        sample_times=robot.simulator.sample_times,
-        inputs=robot.actions.inputs(action.double()),
-        input_times=robot.actions.input_times,
+        sample_times=[robot.simulator.sample_times for robot, _ in trials],
+        inputs={name: [u[name][0] for u in inputs] for name in inputs[0]},
+        input_times=[robot.actions.input_times for robot, _ in trials],
     )
 
 
 def score(name: str, case: int) -> list[dict[str, object]]:
     """Return a row for the chirps, the chosen and the random signals."""
-    robot = robot_of(name, LENGTH)
+    robot = robot_of(name, max(LENGTHS))
     with forked_generators(case, "truth"):
         low, high = robot.prior.base_dist.low, robot.prior.base_dist.high
         theta = low + (high - low) * (0.25 + 0.5 * torch.rand(1, len(low)))
@@ -248,35 +252,31 @@ def score(name: str, case: int) -> list[dict[str, object]]:
         )
 
     begin, sweeps = time.process_time(), robot_of(name, SWEEP)
-    own = recorded(sweeps, chirps(name).repeat(SWEEPS, 1), theta, case)
+    own = recorded([(sweeps, chirps(name).repeat(SWEEPS, 1))], theta, case)
     belief = identify(sweeps.simulator, sweeps.prior, own, seed=case)
     keep("chirps", belief, SWEEP * SWEEPS, begin)
-    wanted, names = belief.draws.std(0), robot.simulator.parameter_names or ()
+    wanted, names = belief.draws.std(0), np.array(robot.simulator.parameter_names)
     for arm in ("chosen", "random"):
-        begin, action, belief = time.process_time(), [], robot.prior
-        left: list[str] = []
-        kept: list[bool] = []
-        for k in range(NUM_CHOSEN):
-            pool = permitted_pool(name, robot, belief, derive_seed(case, k))
+        begin, belief = time.process_time(), robot.prior
+        parts: list[tuple[Robot, Tensor]] = []
+        left, kept = list[str](), list[bool]()
+        for k, seconds in enumerate(LENGTHS):
+            played = robot_of(name, seconds)
+            pool = permitted_pool(name, played, belief, derive_seed(case, k))
             if arm == "chosen":
                 designer = InformationGainDesigner(
                     DiscreteActions(pool), num_samples=NUM_SAMPLES, estimator="linear"
                 )
-                pool = designer.select(
-                    None,
-                    robot.simulator,
-                    belief=belief,
-                    target=left or "theta",
-                    seed=derive_seed(case, k),
-                ).action[None]
-            signal, is_kept = safe(name, robot, belief, pool[:1])
-            action.append(signal)
+                asked = {"target": left or "theta", "seed": derive_seed(case, k)}
+                own = played.simulator
+                pool = designer.select(None, own, belief=belief, **asked).action[None]
+            signal, is_kept = safe(name, played, belief, pool[:1])
+            parts.append((played, signal))
             kept.append(is_kept)
-            trials = recorded(robot, torch.cat(action), theta, case)
+            trials = recorded(parts, theta, case)
             belief = identify(robot.simulator, robot.prior, trials, seed=case)
-            keep(arm, belief, LENGTH * (k + 1), begin, *kept)
-            is_wide = belief.draws.std(0) > wanted
-            left = [name for name, wide in zip(names, is_wide, strict=True) if wide]
+            keep(arm, belief, sum(LENGTHS[: k + 1]), begin, *kept)
+            left = names[belief.draws.std(0) > wanted].tolist()
     return rows
 
 
