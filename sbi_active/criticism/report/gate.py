@@ -80,6 +80,7 @@ def gate_of(
     level: float = 0.01,
     covered: float = 0.7,
     likely: float = 0.2,
+    hides: float = 0.5,
 ) -> Gate:
     """Return the decision on the simulator that a report is of.
 
@@ -93,6 +94,8 @@ def gate_of(
             single numbers one is outside in a third of right sets.
         likely: Probability of the bare model below which trials decide nothing, though
             they raise no alarm.
+        hides: Share of the declared variance in the residuals below which the noise is
+            declared so large that more may hide in it than is left: half of it.
     """
     scored = report.evaluation
     num = 0 if scored is None else len(scored.trials)
@@ -129,7 +132,7 @@ def gate_of(
         reason += f"the simulator lacks in each; check their records, or {MORE}"
         return Gate("NOT_ENOUGH_DATA", reason, {"alike": report.residuals.alike})
     left = found.chi_square / found.degrees_of_freedom
-    if found.lower_p_value <= TOO_SMALL and left < 0.5:  # more may hide than is left
+    if found.lower_p_value <= TOO_SMALL and left < hides:
         reason = f"residuals are {left**0.5:.2g} times the declared noise, which may "
         reason += "hide what the simulator lacks; declare the error of the measurement"
         return Gate("NOT_ENOUGH_DATA", reason, {"residuals": left**0.5})

@@ -130,6 +130,19 @@ def test_uninformed_parameters_keep_their_prior():
     assert after == pytest.approx(before, abs=1e-3)
 
 
+def test_the_budget_is_spent_where_draws_are_few():
+    """Of twelve known parameters beside a free one 446 draws were too few."""
+    prior = Independent(Normal(torch.zeros(13), 1.0), 1)
+    model = SimulatorModel(lambda theta, action: theta[:, :12] * action, noise=0.5)
+    belief = refine(model, prior, torch.ones(1, 1), torch.zeros(1, 12), seed=0)
+    assert belief.diagnostics.trustworthy
+    assert belief.diagnostics.figures["method"] == "smc"
+    exact = 12 * float(Normal(0.0, 1.25**0.5).log_prob(torch.tensor(0.0)))
+    error = belief.diagnostics.figures["log_evidence_error"]
+    assert belief.log_evidence == pytest.approx(exact, abs=4 * error)
+    assert belief.variance[:12].mean().item() == pytest.approx(0.2, rel=0.03)
+
+
 def test_searches_that_agree_on_a_wrong_place_go_on():
     seed = 138
     # Of these oscillations a quarter to one in sixty of the searches ends at the truth.
