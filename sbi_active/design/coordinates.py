@@ -33,30 +33,29 @@ class Coordinates:
     """
 
     def __init__(self, actions: ActionSpace) -> None:
-        self.action_dim = actions.action_dim
-        self._boxes: list[tuple[slice, BoxActions]] = []
+        low, high = torch.full((2, actions.action_dim), torch.nan)
         self._lists: list[tuple[slice, Tensor]] = []
         for part, columns in actions.entries():
             values = part.listed()
             if values is not None:
                 self._lists.append((columns, values))
             elif isinstance(part, BoxActions):
-                self._boxes.append((columns, part))
+                low[columns], high[columns] = part.low, part.high
             else:
                 raise TypeError(
                     f"expected boxes and lists of actions; got {type(part).__name__}; "
                     "use BoxActions, DiscreteActions or MixedActions of them"
                 )
-        self.num_continuous = sum(box.action_dim for _, box in self._boxes)
+        self._boxed = low.isfinite()
+        self._low, self._width = low, high - low
+        self.num_continuous = int(self._boxed.sum())
         self.sizes = [len(values) for _, values in self._lists]
         self.dim = self.num_continuous + len(self.sizes)
 
     def points(self, action: Tensor) -> Tensor:
         """Return points, shape (n, dim), float64, of actions (n, action_dim)."""
-        parts = [torch.empty(len(action), 0).double()]
-        for columns, box in self._boxes:
-            share = (action[:, columns] - box.low) / (box.high - box.low)
-            parts.append(share.double().clamp(0, 1))
+        share = (action - self._low) / self._width
+        parts = [share[:, self._boxed].double().clamp(0, 1)]
         for columns, values in self._lists:
             nearest = torch.cdist(action[:, columns].float(), values).argmin(1)
             parts.append(nearest.double()[:, None])
@@ -64,16 +63,12 @@ class Coordinates:
 
     def actions(self, point: Tensor) -> Tensor:
         """Return actions, shape (n, action_dim), float32, of points (n, dim)."""
-        action = torch.empty(len(point), self.action_dim)
-        start = 0
-        for columns, box in self._boxes:
-            share = point[:, start : start + box.action_dim]
-            start += box.action_dim
-            action[:, columns] = (box.low + share * (box.high - box.low)).float()
-        for columns, values in self._lists:
-            action[:, columns] = values[point[:, start].long()]
-            start += 1
-        return action
+        action = self._low.repeat(len(point), 1).double()
+        share = point[:, : self.num_continuous]
+        action[:, self._boxed] += share * self._width[self._boxed]
+        for k, (columns, values) in enumerate(self._lists, self.num_continuous):
+            action[:, columns] = values[point[:, k].long()].double()
+        return action.float()
 
     def distance(self, point: Tensor, other: Tensor) -> Tensor:
         """Return distances of points (n, dim) to one, infinite to other categories."""

@@ -108,9 +108,8 @@ class Design:
         Args:
             ax: Axes to draw on; None makes a figure.
         """
-        drawn = plot_design(self, ax)
-        figure: Any = drawn.get_figure(root=True)
-        legible(figure)
+        drawn: Any = plot_design(self, ax)
+        legible(drawn.get_figure(root=True))
         return drawn
 
 

@@ -16,12 +16,12 @@ from sbi_active.design.elimination import GainEvaluator, as_batch
 from sbi_active.design.estimators.automatic import by_name, find_estimator
 from sbi_active.design.estimators.base import InformationGainEstimator, at_least
 from sbi_active.design.estimators.model_index import ModelIndexGain, RivalSampler
-from sbi_active.design.given import design_given
+from sbi_active.design.given import GivenSampler
 from sbi_active.design.limits import DesignLimits
 from sbi_active.design.sampler import CandidateSampler
 from sbi_active.design.search import GradientSearch, Search
 from sbi_active.design.target import Target, target_estimator
-from sbi_active.expected import Shown, suggests
+from sbi_active.expected import Shown, require, suggests
 from sbi_active.messages import warn
 from sbi_active.seeding import derive_seed
 from sbi_active.simulation import MissingRowsWarning, Simulations
@@ -179,8 +179,6 @@ class InformationGainDesigner(Shown):
             target, self.estimator, model, simulator, belief, simulations, num_others
         )
         learns = estimator is not None and estimator.needs_model
-        if simulations is not None:
-            return design_given(simulations, estimator, model, belief, limits, seed)
         listed, notes = limits.listed()
         budget = self._budget(budget, listed)
         steps: list[Design] = []
@@ -189,17 +187,20 @@ class InformationGainDesigner(Shown):
             if target == "model":
                 sampler = RivalSampler(model, own)
                 estimator = ModelIndexGain(sampler.probability)
+            elif simulations is not None:
+                sampler = GivenSampler(simulations, limits)
+                listed, budget = sampler.action, 0
             else:
                 probed = listed
                 if probed is None:
                     probed = self.actions.sample((16,), seed=derive_seed(own, "probed"))
-                assert simulator is not None
                 assert belief is not None
                 sampler = CandidateSampler(
-                    *(simulator, belief, probed, own, self.workers, others),
+                    *(simulator, belief, probed, own, self.workers),
                     # A model was learned from whole outcomes.
                     most_numbers=math.inf if learns else self.most_numbers,
                     replicates=estimator is None or estimator.needs_noise,
+                    others=others,
                 )
             gains = GainEvaluator(sampler, estimator, model, belief, limits, own)
             finalists = listed
@@ -216,6 +217,8 @@ class InformationGainDesigner(Shown):
                 )
             )
             others = torch.cat([others, steps[-1].action[None]])
+            if isinstance(sampler, GivenSampler):
+                steps = [sampler.of_rows(steps[-1])]
         design = as_batch(steps)
         if design.num_missing:
             warn(
@@ -235,9 +238,7 @@ class InformationGainDesigner(Shown):
         if budget is None:
             size = self.search.size(self.actions) if listed is None else len(listed)
             return self.num_samples * size
-        if listed is not None and budget < 8 * len(listed):
-            raise ValueError(
-                f"expected a budget >= {8 * len(listed)}, 8 a candidate; got {budget}; "
-                "allow more simulations or fewer candidates"
-            )
+        least = 0 if listed is None else 8 * len(listed)
+        advice = "allow more simulations or fewer candidates"
+        require(budget >= least, f"a budget >= {least}, 8 a candidate", budget, advice)
         return budget

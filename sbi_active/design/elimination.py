@@ -14,11 +14,10 @@ from sbi_active.design.design import Design
 from sbi_active.design.estimators.automatic import choose_estimator
 from sbi_active.design.estimators.base import (
     CandidateSimulations,
-    InformationGainEstimator,
+    Sampler,
     standard_error,
 )
 from sbi_active.design.estimators.entropy import EntropyGain
-from sbi_active.design.estimators.model_index import RivalSampler
 from sbi_active.design.limits import DesignLimits
 from sbi_active.design.outcomes import JointLikelihood, conditional_gain
 from sbi_active.design.sampler import CandidateSampler
@@ -91,7 +90,7 @@ class GainEvaluator:
 
     Attributes:
         sampler: Sampler of the outcomes.
-        chosen: Estimator of the information; None is chosen by the first simulations.
+        estimator: Estimator of the information; None is chosen by the first draw.
         model: Model that the estimator needs.
         belief: Distribution of the parameters; None for rivals.
         limits: Limits and costs of the actions.
@@ -100,8 +99,8 @@ class GainEvaluator:
             None before the first simulations.
     """
 
-    sampler: CandidateSampler | RivalSampler
-    chosen: InformationGainEstimator | None
+    sampler: Sampler
+    estimator: Any
     model: Any
     belief: Distribution | None
     limits: DesignLimits
@@ -113,12 +112,6 @@ class GainEvaluator:
         if self.num_others:  # of joint outcomes nothing else says anything
             joint = JointLikelihood(self.model, self.sampler.others.shape[1])
             self.model = joint if hasattr(self.model, "log_likelihood") else None
-
-    @property
-    def estimator(self) -> InformationGainEstimator:
-        """The estimator given, or the one chosen by the first simulations."""
-        assert self.chosen is not None
-        return self.chosen
 
     def draw(
         self, num_samples: int, action: Tensor, *, halves: bool = False
@@ -134,19 +127,18 @@ class GainEvaluator:
         drawn = sampler.draw(num_samples, action)
         if self.notes is not None:
             return drawn
-        if self.chosen is None:
+        if self.estimator is None:
             num_rows = num_samples // 2 if halves else num_samples
-            self.chosen, self.notes = choose_estimator(
-                self.model, drawn, self.belief, num_rows=num_rows
-            )
+            given = self.model, drawn, self.belief, num_rows
+            self.estimator, self.notes = choose_estimator(*given)
             # A model was learned from whole outcomes.
-            if sampler.summaries is not None and self.chosen.needs_model:
+            if sampler.summaries is not None and self.estimator.needs_model:
                 sampler.summaries = None
                 sampler.rewind()
                 return sampler.draw(num_samples, action)
         else:
-            self.notes = self.chosen.problems(drawn)
-        if not self.chosen.needs_slopes(drawn):
+            self.notes = self.estimator.problems(drawn)
+        if not self.estimator.needs_slopes(drawn):
             return drawn
         assert isinstance(sampler, CandidateSampler)
         sampler.has_slopes = True
@@ -193,7 +185,7 @@ class GainEvaluator:
 
     def _least(self, most: int) -> int:
         """Return the simulations that an estimate needs, at most so many."""
-        needed = (self.chosen or EntropyGain).fewest  # by which one is chosen
+        needed = (self.estimator or EntropyGain).fewest  # by which one is chosen
         return max(8, min(needed, most // 4 * 4))
 
     def eliminate(
@@ -278,31 +270,20 @@ class GainEvaluator:
                 "declare the noise, SimulatorModel(fn, noise=...), or train on more"
             )
         return choose(
-            limits,
-            action=action,
-            halves=gains,
-            eligible=eligible,
-            leader=int(active[race.leader]),
-            seed=self.seed,
+            *(limits, action, gains, eligible, int(active[race.leader]), self.seed),
             probability_valid=num[0] / num[1].double(),
-            num_samples=spent,
-            estimator=type(self.estimator).__name__,
             bound=bound,
             num_simulations=sampler.num_drawn,
             num_missing=sampler.num_missing,
+            num_samples=spent,
+            estimator=type(self.estimator).__name__,
             stopped=stopped,
             notes=(*said, *sampler.notes, *notes),
         )
 
 
-def _halves(simulations: CandidateSimulations) -> list[CandidateSimulations]:
-    half = len(simulations.theta) // 2
-    return [simulations.samples(slice(k * half, (k + 1) * half)) for k in range(2)]
-
-
 def choose(
     limits: DesignLimits,
-    *,
     action: Tensor,
     halves: Tensor,
     eligible: Tensor,
@@ -323,8 +304,8 @@ def choose(
         **known: Fields of the :class:`.Design` that are known already.
     """
     price, report = limits.cost(action), halves[1]
+    probability_best = torch.zeros(len(price)).double()
     utility = torch.cat([*halves], 1)[eligible] / price[eligible, None]
-    probability_best = torch.zeros(len(price), dtype=torch.float64)
     probability_best[eligible] = Race(utility, seed).probability_best
     return Design(
         action=action[leader],
@@ -338,6 +319,11 @@ def choose(
         labels=limits.actions.entry_labels,
         **known,
     )
+
+
+def _halves(simulations: CandidateSimulations) -> list[CandidateSimulations]:
+    half = len(simulations.theta) // 2
+    return [simulations.samples(slice(k * half, (k + 1) * half)) for k in range(2)]
 
 
 def as_batch(steps: list[Design]) -> Design:

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import copy
 import math
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -19,65 +19,49 @@ from sbi_active.simulation.conditions import parameters_of
 Cost = Callable[..., Tensor]
 
 
+@dataclass(frozen=True)
 class DesignLimits:
     """Limits and costs of the actions that may be chosen.
 
-    Args:
+    Attributes:
         actions: The space.
         constraint: Function of actions (n, action_dim) that says which are permitted,
             shape (n,), bool; None permits all.
-        price: Cost of actions (n, action_dim), shape (n,), which may depend on the
-            action executed before, ``price(action, previous)``; None for none.
+        cost_of: Cost of actions (n, action_dim), shape (n,), which may depend on the
+            action executed before, ``cost_of(action, previous)``; None for none.
         least: Share of measurements that a choice needs.
-
-    Attributes:
-        is_sequential: Whether the cost depends on the action executed before.
-        previous: That action, shape (action_dim,); None before any.
+        previous: Action executed before, shape (action_dim,); None before any.
         left: Largest cost of an action.
     """
 
-    def __init__(
-        self,
-        actions: ActionSpace,
-        constraint: Callable[[Tensor], Tensor] | None = None,
-        price: Cost | None = None,
-        least: float = 0.0,
-    ) -> None:
-        self.actions, self.constraint, self.least = actions, constraint, least
-        self._price: Any = price
-        self.is_sequential = takes_second(price, "previous")
-        self.previous: Tensor | None = None
-        self.left = math.inf
+    actions: ActionSpace
+    constraint: Callable[[Tensor], Tensor] | None = None
+    cost_of: Cost | None = None
+    least: float = 0.0
+    previous: Tensor | None = None
+    left: float = math.inf
 
-    def after(self, previous: Tensor | None, left: float = math.inf) -> DesignLimits:
-        """Return the limits of a trial after another, with what is left to spend.
-
-        Args:
-            previous: Action executed before, shape (action_dim,); None for none.
-            left: Largest cost of an action.
-        """
-        own = copy.copy(self)
-        own.previous, own.left = previous, left
-        return own
+    @property
+    def is_sequential(self) -> bool:
+        """Whether the cost depends on the action executed before."""
+        return takes_second(self.cost_of, "previous")
 
     @property
     def price(self) -> Callable[[Tensor], Tensor] | None:
         """Cost of actions (n, action_dim) after the one before; None for none."""
+        cost: Any = self.cost_of
         if not self.is_sequential:
-            return self._price
-        return lambda action: self._price(action, self.previous)
+            return cost
+        return lambda action: cost(action, self.previous)
 
     def __call__(self, action: Tensor) -> Tensor:
         """Return a mask of permitted actions (n, action_dim), shape (n,), bool."""
         inside = self.actions.permits(action)
         if self.constraint is not None:
             answer = torch.as_tensor(self.constraint(action))
-            if answer.shape != inside.shape:
-                raise ValueError(
-                    f"expected a constraint that maps actions {tuple(action.shape)} to "
-                    f"({len(action)},), bool; got shape {tuple(answer.shape)}; "
-                    "return one answer a row"
-                )
+            expected = f"a constraint that maps {(*action.shape,)} to ({len(action)},)"
+            fits, got = answer.shape == inside.shape, f"shape {(*answer.shape,)}"
+            require(fits, expected, got, "return one bool a row")
             inside = inside & answer.bool()
         if self.left < math.inf:
             inside = inside & (self.cost(action) <= self.left)
@@ -121,12 +105,10 @@ class DesignLimits:
         if self.price is None:
             return torch.ones(len(action)).double()
         given = torch.as_tensor(self.price(action)).double()
-        if given.shape != (len(action),) or not bool((given > 0).all()):
-            raise ValueError(
-                f"expected positive costs of shape ({len(action)},); got shape "
-                f"{tuple(given.shape)}, {given.flatten()[:4].tolist()}, ...; return "
-                "one positive number an action"
-            )
+        fits = given.shape == (len(action),) and bool((given > 0).all())
+        expected = f"positive costs of shape ({len(action)},)"
+        got = f"shape {(*given.shape,)}, {given.flatten()[:4].tolist()}, ..."
+        require(fits, expected, got, "return one positive number an action")
         return given
 
     def reached_by(self, valid: Tensor) -> Tensor:
@@ -138,22 +120,20 @@ class DesignLimits:
             ValueError: If none does; it names the largest share.
         """
         eligible, most = valid >= self.least, float(valid.nan_to_num(0.0).max())
-        if not bool(eligible.any()):
-            raise ValueError(
-                "expected a candidate that gives a measurement with a probability of "
-                f"at least {self.least:g}; got {most:.3g} at most, 0 where every row "
-                "was lost to faults; look at the simulator's tracebacks, lower "
-                "min_probability_valid or add gentler candidates"
-            )
+        require(
+            bool(eligible.any()),
+            f"a candidate measured with a probability of at least {self.least:g}",
+            f"{most:.3g} at most, 0 where every row was lost to faults",
+            "look at the simulator's tracebacks, lower min_probability_valid or add "
+            "gentler candidates",
+        )
         return eligible
 
     def excluded_note(self, eligible: Tensor) -> tuple[str, ...]:
         """Return a note on the number of excluded candidates; empty if none is."""
-        num, least = int((~eligible).sum()), f"{self.least:g}"
-        note = (
-            f"{num} of {len(eligible)} candidates excluded: a measurement is less "
-            f"probable than {least}, or every simulation was lost"
-        )
+        num = int((~eligible).sum())
+        note = f"{num} of {len(eligible)} candidates excluded: a measurement is less "
+        note += f"probable than {self.least:g}, or every simulation was lost"
         return (note,) if num else ()
 
 

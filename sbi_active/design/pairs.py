@@ -41,17 +41,17 @@ def first_of_pair(
     alone, steps = gain / cost, [design]
     plans: list[tuple[float, float, list[int]]] = []  # nats, cost, order
     for k in _largest(alone, num):
-        after = limits.after(candidates[k], limits.left - float(cost[k]))
+        after = replace(
+            limits, previous=candidates[k], left=limits.left - float(cost[k])
+        )
         near = torch.nonzero(after(candidates))[:, 0]
-        if not len(near):
-            plans.append((float(gain[k]), float(cost[k]), [k]))
-            continue
-        then = after.cost(candidates[near])
-        best = _largest(gain[near] / then, num)
-        steps.append(beyond(candidates[k], candidates[near[best]]))
-        told = gain[k] + steps[-1].expected_information_gain.nan_to_num(0.0)
-        orders = [[k, j] for j in near[best].tolist()]
-        paid = cost[k] + then[best]
+        told, paid, orders = gain[[k]], cost[[k]], [[k]]
+        if len(near):
+            then = after.cost(candidates[near])
+            best = _largest(gain[near] / then, num)
+            steps.append(beyond(candidates[k], candidates[near[best]]))
+            told = told + steps[-1].expected_information_gain.nan_to_num(0.0)
+            orders, paid = [[k, j] for j in near[best].tolist()], paid + then[best]
         plans += zip(told.tolist(), paid.tolist(), orders, strict=True)
     told, paid, pair = max(plans, key=lambda plan: plan[0] / plan[1])
     # Either order tells the same: what tells more by itself is not put off for ever.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from itertools import product
 from typing import Any
@@ -13,7 +13,11 @@ import torch
 from torch import Tensor
 from torch.distributions import Distribution
 
-from sbi_active.design.estimators.base import CandidateSimulations, noise_scale
+from sbi_active.design.estimators.base import (
+    CandidateSimulations,
+    Sampler,
+    noise_scale,
+)
 from sbi_active.design.outcomes import LinearSummaries, join_outcomes
 from sbi_active.seeding import derive_seed, forked_generators, row_seeds
 from sbi_active.simulation import (
@@ -28,10 +32,11 @@ from sbi_active.simulation.simulator import require_noise
 from sbi_active.simulation.workers.settings import Workers
 
 
-class CandidateSampler:
+@dataclass(eq=False)
+class CandidateSampler(Sampler):
     """Draw parameters from the belief and simulate candidates at them.
 
-    Args:
+    Attributes:
         simulator: ``simulator(theta, action)``.
         belief: Distribution of the parameters.
         probed: Actions to look at the simulator with, shape (a, action_dim).
@@ -44,37 +49,25 @@ class CandidateSampler:
             allows for it; infinite keeps all.
         replicates: Whether half of the simulations repeat the parameters of the others,
             unless the noise is declared.
-
-    Attributes:
+        has_slopes: Whether draws have slopes of the simulator.
         declared: Whether the simulator declares its noise around an output that does
             not change from run to run.
-        num_drawn: Simulations so far.
-        num_missing: Number of those simulations lost to faults of the simulator.
-        summaries: Summaries that stand for the numbers of an outcome; None keeps all.
-        has_slopes: Whether draws have slopes of the simulator.
     """
 
-    has_slopes = False
+    simulator: Any
+    belief: Distribution
+    probed: Tensor
+    seed: int
+    workers: Workers
+    most_numbers: float
+    replicates: bool
+    others: Tensor
+    has_slopes: bool = False
 
-    def __init__(
-        self,
-        simulator: Callable[..., Any],
-        belief: Distribution,
-        probed: Tensor,
-        seed: int,
-        workers: Workers,
-        others: Tensor,
-        most_numbers: float,
-        replicates: bool,
-    ) -> None:
-        self.simulator, self.belief = simulator, belief
-        self.seed, self.workers, self.others = seed, workers, others
-        self.replicates = replicates
-        self.num_drawn = self.num_missing = self._num_waves = 0
-        self.declared = self._probe(probed)
-        self.summaries: LinearSummaries | None = None
-        noise = getattr(simulator, "noise", None)
-        many = self.declared and self._num_numbers > most_numbers
+    def __post_init__(self) -> None:
+        self.declared = self._probe(self.probed)
+        noise = getattr(self.simulator, "noise", None)
+        many = self.declared and self._num_numbers > self.most_numbers
         if many and noise is not None and noise.is_known_gaussian:
             self.summaries = LinearSummaries(noise)
 
@@ -137,10 +130,6 @@ class CandidateSampler:
     def _is_paired(self) -> bool:
         return self.replicates and not self.declared
 
-    def rewind(self) -> None:
-        """Repeat the parameters and the noise of the first draw in the next."""
-        self._num_waves = 0
-
     def _draw(
         self, theta: Tensor, action: Tensor, label: str
     ) -> CandidateSimulations | None:
@@ -165,7 +154,6 @@ class CandidateSampler:
         measured = mean.flatten(2).isfinite() | missing[..., None]
         if self._num_waves == 1 and self._lost_by_luck(theta, action, measured):
             return None
-        assert isinstance(self.simulator, SimulatorModel)
         short = self.summaries
         noise = self.simulator.noise if short is None else GaussianNoise(1.0)
         assert noise is not None
@@ -185,7 +173,6 @@ class CandidateSampler:
         Long ones are kept in memory for so many rows of an action at a time: of 10,000
         numbers these take some 200 MB.
         """
-        assert isinstance(self.simulator, SimulatorModel)
         short, run = self.summaries, self.simulator.mean
         if short is None:
             return self._run(run, theta, action, key)
@@ -227,7 +214,6 @@ class CandidateSampler:
             return False
         some = slice(None, None, -(-len(a) // most))
         a, i = a[some], i[some]
-        assert isinstance(self.simulator, SimulatorModel)
         again = self._simulate(self.simulator.mean, (theta[i], action[a]), "retry")
         self.num_drawn += len(again)
         self.num_missing += again.counts["missing"]

@@ -6,7 +6,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import ClassVar
+from typing import ClassVar, NamedTuple
 
 import torch
 from attrs import frozen
@@ -17,15 +17,14 @@ from typing_extensions import override
 from sbi_active.actions import ActionSpace
 from sbi_active.arrays import Array
 from sbi_active.design.coordinates import Coordinates
-from sbi_active.expected import Shown
+from sbi_active.expected import Shown, require
 from sbi_active.inference.sampling.gaussian_process import IN_CUBE, GaussianProcess
 from sbi_active.seeding import derive_seed
 
 Score = Callable[[Tensor], Tensor]
 
 
-@dataclass(frozen=True)
-class Evaluations:
+class Evaluations(NamedTuple):
     """Estimates of the utility.
 
     Attributes:
@@ -42,13 +41,12 @@ class Evaluations:
 
     def join(self, other: Evaluations) -> Evaluations:
         """Return these and others."""
-        pairs = zip(vars(self).values(), vars(other).values(), strict=True)
-        return Evaluations(*(torch.cat(pair) for pair in pairs))
+        return Evaluations(*map(torch.cat, zip(self, other, strict=True)))
 
     def known(self) -> Evaluations:
         """Return the evaluations that are numbers."""
         keep = self.utility.isfinite() & self.standard_error.isfinite()
-        return Evaluations(*(part[keep] for part in vars(self).values()))
+        return Evaluations(*(part[keep] for part in self))
 
 
 @dataclass(frozen=True)
@@ -174,12 +172,9 @@ class GradientSearch(Search):
     @override
     def num_evaluations(self, budget: int, num_samples: int) -> int:
         num = budget // 2 // num_samples
-        if num < self.fewest:
-            raise ValueError(
-                f"expected a budget >= {2 * self.fewest * num_samples}, half of it for "
-                f"{self.fewest} actions of {num_samples} simulations; got {budget}; "
-                "allow more simulations"
-            )
+        least = f"a budget >= {2 * self.fewest * num_samples}, half of it for "
+        least += f"{self.fewest} actions of {num_samples} simulations"
+        require(num >= self.fewest, least, budget, "allow more simulations")
         return num
 
     @override
@@ -204,12 +199,10 @@ class GradientSearch(Search):
         space = objective.space
         drawn = space.drawn(self.choice * num, derive_seed(objective.seed, key))
         point = drawn[objective.allows(drawn)]
-        if len(point) < min(num, self.fewest):
-            raise ValueError(
-                f"expected a constraint that permits a part of {objective.actions!r}; "
-                f"got {len(point)} of {len(drawn)} actions; narrow the space to about "
-                "what is permitted"
-            )
+        enough = len(point) >= min(num, self.fewest)
+        expected = f"a constraint that permits a part of {objective.actions!r}"
+        got = f"{len(point)} of {len(drawn)} actions"
+        require(enough, expected, got, "narrow the space to about what it permits")
         return space.filling(point, num)
 
     def _best(
@@ -290,20 +283,14 @@ def ascended(
 
     first = start[:, :c].flatten().numpy()
     with torch.enable_grad():
-        found = minimize(
-            *(fall, first),
-            jac=True,
-            method="L-BFGS-B",
-            bounds=[(0.0, 1.0)] * len(first),
-            options={"maxiter": num_steps},
-        )
+        inside, steps = [(0.0, 1.0)] * len(first), {"maxiter": num_steps}
+        limits = {"bounds": inside, "options": steps}
+        found = minimize(fall, first, jac=True, method="L-BFGS-B", **limits)
     end = torch.cat([torch.from_numpy(found.x).reshape(-1, c), fixed], 1)
     inside = torch.where(objective.allows(end)[:, None], end, start)
     for _ in range(10):  # a thousandth of the way
         middle = 0.5 * (inside + end)
         allowed = objective.allows(middle)[:, None]
-        inside, end = (
-            torch.where(allowed, middle, inside),
-            torch.where(allowed, end, middle),
-        )
+        inside = torch.where(allowed, middle, inside)
+        end = torch.where(allowed, end, middle)
     return inside

@@ -14,6 +14,7 @@ from sbi_active.design.estimators.base import InformationGainEstimator
 from sbi_active.design.estimators.linear import LinearGain
 from sbi_active.design.estimators.posterior import ParameterGain
 from sbi_active.design.limits import takes_second
+from sbi_active.expected import require
 from sbi_active.seeding import draws_of, forked_generators
 from sbi_active.simulation import Simulations
 
@@ -51,42 +52,39 @@ def target_estimator(
     Raises:
         ValueError: If what the target or the estimator needs is lacking.
     """
+    kind = type(model).__name__
     if target == "model":
         fits = isinstance(model, Sequence) and simulations is None
-        if given != "auto" or num_others or not fits:
-            raise ValueError(
-                "expected estimator='auto', a sequence of rivals, no simulations= and "
-                f"one action at a time for target='model'; got {given!r}, "
-                f"{type(model).__name__} and {num_others} others; pass objects with "
-                "probability and predict(action, num_samples, seed)"
-            )
+        require(
+            given == "auto" and fits and not num_others,
+            "estimator='auto', a sequence of rivals, no simulations= and one action at "
+            "a time for target='model'",
+            f"{given!r}, {kind} and {num_others} others",
+            "pass objects with probability and predict(action, num_samples, seed)",
+        )
         return None
     if belief is None or (simulator is None and simulations is None):
         raise ValueError(
             "expected a simulator and belief=, the distribution of its parameters; got "
-            f"{'no belief' if belief is None else 'no simulator'}, and the model has "
-            "none; pass both"
+            f"no {'belief' if belief is None else 'simulator'}; pass both"
         )
-    if simulations is not None and num_others:
-        raise ValueError(
-            "expected one action and none pending with simulations=, rows of single "
-            f"outcomes; got {num_others} others; leave out simulations="
-        )
+    require(
+        simulations is None or model is not None and not num_others,
+        "a model, one action and none pending with simulations=, of single outcomes",
+        *(f"{kind} and {num_others} others", "pass the trained model, or leave it out"),
+    )
     if target == "theta":
         estimator = find_estimator(given)
         lacks = model is None or num_others and not hasattr(model, "log_likelihood")
-        if estimator is not None and estimator.needs_model and lacks:
-            raise ValueError(
-                f"expected a model for {type(estimator).__name__}, with log_likelihood "
-                f"if several actions are to tell together; got {type(model).__name__}; "
-                "pass the trained posterior, or estimator='auto'"
-            )
-        return estimator
-    if given not in ("auto", "linear"):
-        raise ValueError(
-            f"expected estimator='auto' or 'linear' for target={name_of(target)!r}; "
-            f"got {given!r}; leave out estimator="
+        require(
+            estimator is None or not (estimator.needs_model and lacks),
+            f"a model for {type(estimator).__name__}, with log_likelihood if several "
+            "actions are to tell together",
+            *(kind, "pass the trained posterior, or estimator='auto'"),
         )
+        return estimator
+    known = f"estimator='auto' or 'linear' for target={name_of(target)!r}"
+    require(given in ("auto", "linear"), known, repr(given), "leave out estimator=")
     if callable(target):
         quantity = Quantity(target, simulator, belief)
         num = quantity.num_draws
@@ -105,12 +103,12 @@ def _named(names: str | Sequence[str], simulator: Any) -> Callable[[Tensor], Ten
     """
     known = [*(getattr(simulator, "parameter_names", None) or ())]
     wanted = [names] if isinstance(names, str) else [*names]
-    if not wanted or not {*wanted} <= {*known} or len({*wanted}) < len(wanted):
-        raise ValueError(
-            "expected target 'theta', 'model', a function, or different names among "
-            f"{known}, the simulator's parameter_names; got {names!r}; choose one or "
-            "more of these"
-        )
+    require(
+        bool(wanted) and {*wanted} <= {*known} and len({*wanted}) == len(wanted),
+        "target 'theta', 'model', a function, or different names among the simulator's "
+        f"parameter_names {known}",
+        *(repr(names), "choose one or more of these"),
+    )
     index = [known.index(name) for name in wanted]
     return lambda theta: theta[:, index]
 
@@ -153,23 +151,17 @@ class Quantity:
         num_shared: int = 4,
     ) -> None:
         self.function, self.num_draws = function, num_draws
-        self._effects = [
-            effect
-            for effect in getattr(simulator, "effects", ())
-            if effect.scope == "campaign"
-        ]
+        every = getattr(simulator, "effects", ())
+        self._effects = [e for e in every if e.scope == "campaign"]
         self._known: dict[bytes, Tensor] = {}
         theta = draws_of(belief, num_draws, 0, "marginal")
         value = self._value(theta)
         self.center, self.scale = value.mean(0), value.std(0)
         size = value.abs().amax(0)
         constant = torch.nonzero(~(self.scale > 1e-9 * size))[:, 0].tolist()
-        if constant:
-            raise ValueError(
-                "expected values of target= that differ between parameters; got the "
-                f"same for {num_draws} draws of the belief in column {constant[0]} of "
-                f"{value.shape[1]}; return what depends on the parameters"
-            )
+        got = f"the same for {num_draws} draws of the belief in columns {constant}"
+        expected = "values of target= that differ between parameters"
+        require(not constant, expected, got, "return what depends on the parameters")
         num_values = torch.tensor([len(column.unique()) for column in value.T])
         self.jitter = 0.1 * (num_values * num_shared < num_draws).double()
         self.direction = torch.eye(value.shape[1], dtype=torch.float64)
@@ -202,11 +194,11 @@ class Quantity:
         value = torch.as_tensor(self.function(*given)).detach().double()
         value = value[:, None] if value.ndim == 1 else value
         lost = int((~value.isfinite()).sum())
-        if value.ndim != 2 or len(value) != len(theta) or not value.shape[1] or lost:
-            raise ValueError(
-                f"expected finite values of target= of shape ({len(theta)},) or "
-                f"({len(theta)}, k) at parameters {tuple(theta.shape)}; got "
-                f"{tuple(value.shape)}, {lost} of them NaN or inf; return a number in "
-                "each row, such as the largest loss where a controller fails"
-            )
+        n = len(theta)
+        require(
+            value.ndim == 2 and len(value) == n and value.shape[1] > 0 and not lost,
+            f"finite values of target= of shape ({n},) or ({n}, k)",
+            f"{tuple(value.shape)}, {lost} of them NaN or inf",
+            "return a number in each row, such as the largest loss of a failure",
+        )
         return value

@@ -74,7 +74,7 @@ class Planner:
         permitted(self._limits)
         some = _listed_or_drawn(actions, 8)
         self._limits.cost(some)
-        self._limits.after(some[0]).cost(some)
+        replace(self._limits, previous=some[0]).cost(some)
         self._designs = find_method(state.method).designs
         self._make_designer = partial(
             InformationGainDesigner,
@@ -98,7 +98,7 @@ class Planner:
             return
         for trial in state.trials:
             if trial.status != "pending":
-                cost = self._limits.after(previous).cost(trial.action[None])
+                cost = replace(self._limits, previous=previous).cost(trial.action[None])
                 state.change(trial.index, cost=float(cost))
                 previous = trial.action
 
@@ -111,7 +111,7 @@ class Planner:
         told = [t.action for t in self._state.trials if t.status != "pending"]
         left, budget = self._state.left, self._state.options.stop.budget
         most = math.inf if left is None or budget is None else left + slack * budget
-        return self._limits.after(told[-1] if told else None, most)
+        return replace(self._limits, previous=told[-1] if told else None, left=most)
 
     @property
     def spent_up(self) -> str | None:

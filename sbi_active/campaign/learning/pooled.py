@@ -194,13 +194,9 @@ class PooledLearner(Learner):
         eligible = limits.reached_by(shares)
         utility = (rows.mean(1) / limits.cost(listed)).masked_fill(~eligible, -math.inf)
         num, missing = self._spent(before)
+        halves = rows.unflatten(1, (2, -1)).transpose(0, 1)
         return choose(
-            limits,
-            action=listed,
-            halves=rows.unflatten(1, (2, -1)).transpose(0, 1),
-            eligible=eligible,
-            leader=int(utility.argmax()),
-            seed=seed,
+            *(limits, listed, halves, eligible, int(utility.argmax()), seed),
             probability_valid=shares,
             estimator="PooledGain",
             bound="none",

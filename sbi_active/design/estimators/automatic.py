@@ -21,6 +21,7 @@ from sbi_active.design.estimators.entropy import EntropyGain, random_presence
 from sbi_active.design.estimators.linear import LinearGain
 from sbi_active.design.estimators.nested import NestedGain
 from sbi_active.design.estimators.posterior import ParameterGain
+from sbi_active.expected import require
 from sbi_active.messages import warn
 
 #: Name of an estimator: its class.
@@ -78,11 +79,9 @@ def by_name(given: Any, what: str, kind: type, known: Mapping[str, type]) -> Any
         now = FORMER[given]
         warn(f'SA701 {what}={given!r} goes in the next version: use {what}="{now}"')
         given = now
-    if given not in known:
-        raise ValueError(
-            f"expected {what} among 'auto', {', '.join(map(repr, known))}; got "
-            f"{given!r}; choose one of these or pass an object of your own"
-        )
+    names = ", ".join(map(repr, ("auto", *known)))
+    advice = "choose one of these or pass an object of your own"
+    require(given in known, f"{what} among {names}", repr(given), advice)
     return known[given]()
 
 
@@ -90,7 +89,6 @@ def choose_estimator(
     model: Any,
     simulations: CandidateSimulations,
     belief: Distribution | None,
-    *,
     num_rows: int | None = None,
 ) -> tuple[InformationGainEstimator, list[str]]:
     """Return the first estimator whose assumptions pass their checks.
@@ -131,10 +129,9 @@ def choose_estimator(
             return each, notes
         new = [text for text in problems if not any(text in note for note in notes)]
         notes += [f"{type(each).__name__} not used: {text}" for text in new]
-    if hasattr(model, "log_posterior"):
-        return PosteriorGain(), notes
-    if hasattr(model, "log_likelihood"):
-        return LikelihoodGain(), notes
+    for kind in (PosteriorGain, LikelihoodGain):
+        if hasattr(model, kind.functions[0]):
+            return kind(), notes
     if hasattr(model, "log_ratio"):
         bound, few = InfoNCEGain(), simulations.samples(slice(256))
         cautions = bound.cautions(bound(model, few, belief))

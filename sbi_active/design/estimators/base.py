@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
@@ -10,7 +11,7 @@ import torch
 from torch import Tensor
 from torch.distributions import Distribution
 
-from sbi_active.expected import Shown
+from sbi_active.expected import Shown, require
 from sbi_active.simulation import NoiseModel
 
 Bound = Literal["lower", "upper", "none"]
@@ -113,6 +114,31 @@ class CandidateSimulations:
         return {name: part for name, part in parts.items() if part is not None}
 
 
+class Sampler(ABC):
+    """Source of outcomes of candidates.
+
+    Attributes:
+        others: Actions whose outcomes will be known as well, shape (p, action_dim).
+        summaries: Summaries that stand for the numbers of an outcome; None keeps all.
+        notes: Notes on the outcomes.
+        num_drawn: Simulations so far.
+        num_missing: Number of those simulations lost to faults of the simulator.
+    """
+
+    others: Tensor = torch.empty(0, 0)
+    summaries: Any = None
+    notes: Sequence[str] = ()
+    num_drawn = num_missing = _num_waves = 0
+
+    @abstractmethod
+    def draw(self, num_samples: int, action: Tensor) -> CandidateSimulations:
+        """Return outcomes of candidates (a, action_dim) at the same parameters."""
+
+    def rewind(self) -> None:
+        """Repeat the parameters and the noise of the first draw in the next."""
+        self._num_waves = 0
+
+
 class InformationGainEstimator(Shown, ABC):
     r"""Estimator of :math:`I(\theta; x | \xi)` in nats for a set of candidates.
 
@@ -151,28 +177,28 @@ class InformationGainEstimator(Shown, ABC):
                 replicated where it is needed, or the model gives NaN for an outcome.
         """
         theta, action, x = simulations.theta, simulations.action, simulations.x
-        if x.ndim < 3 or x.shape[:2] != (len(action), len(theta)):
-            raise ValueError(
-                f"expected x of shape ({len(action)}, {len(theta)}, *x_shape), one "
-                f"outcome a candidate and parameter set; got {tuple(x.shape)}; "
-                "simulate every candidate at the same parameters"
-            )
-        unknown = simulations.mean is None or simulations.noise is None
-        if self.needs_noise and unknown and simulations.replicate is None:
-            raise ValueError(
-                f"expected declared noise or replicates for {type(self).__name__}; got "
-                "neither; build SimulatorModel(fn, noise=...) around a noise-free "
-                "fn, or simulate every theta twice"
-            )
+        require(
+            x.ndim > 2 and x.shape[:2] == (len(action), len(theta)),
+            f"x of shape ({len(action)}, {len(theta)}, *x_shape)",
+            *(tuple(x.shape), "simulate every candidate at the same parameters"),
+        )
+        declared = simulations.mean is not None and simulations.noise is not None
+        require(
+            declared or simulations.replicate is not None or not self.needs_noise,
+            *(f"declared noise or replicates for {type(self).__name__}", "neither"),
+            "build SimulatorModel(fn, noise=...) around a noise-free fn, or simulate "
+            "every theta twice",
+        )
         with torch.no_grad():
             gain = self._contributions(model, simulations, belief).double()
         lost = int((gain.isnan() & simulations.counted).sum())
-        if self.needs_model and lost:  # a mean of the others would hide it
-            raise ValueError(
-                f"expected densities of {type(model).__name__}; got NaN at {lost} of "
-                f"{gain.numel()} outcomes; give a model that says how probable an "
-                "outcome without a measurement is, x = NaN, or train it again"
-            )
+        require(  # a mean of the others would hide it
+            not (self.needs_model and lost),
+            f"densities of {type(model).__name__}",
+            f"NaN at {lost} of {gain.numel()} outcomes",
+            "give a model that says how probable an outcome without a measurement is, "
+            "x = NaN, or train it again",
+        )
         return gain.masked_fill(~simulations.counted, torch.nan)
 
     def bound_on(self, model: Any) -> Bound:
@@ -225,9 +251,7 @@ def whitening(theta: Tensor) -> tuple[Tensor, Tensor]:
 def noise_scale(simulations: CandidateSimulations) -> Tensor:
     """Return the root mean square of declared noise, shape (a, numbers of x)."""
     assert simulations.mean is not None
-    square = (simulations.x - simulations.mean).flatten(2).double().square()
-    finite = square.isfinite()
-    square = torch.where(finite, square, 0.0).sum(1) / finite.sum(1).clamp_min(1)
+    square = (simulations.x - simulations.mean).flatten(2).double().square().nanmean(1)
     return torch.where(square > 0, square, 1.0).sqrt()
 
 
@@ -241,6 +265,5 @@ def standard_error(contributions: Tensor) -> Tensor:
 
 def at_least(value: int, least: int, name: str, usual: int) -> int:
     """Return a count, or raise a ValueError where it is too small."""
-    if value < least:
-        raise ValueError(f"expected {name} >= {least}; got {value}; use about {usual}")
+    require(value >= least, f"{name} >= {least}", value, f"use about {usual}")
     return value

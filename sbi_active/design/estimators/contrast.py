@@ -24,6 +24,7 @@ from sbi_active.design.estimators.base import (
     at_least,
     standard_error,
 )
+from sbi_active.expected import require
 from sbi_active.seeding import derive_seed, forked_generators
 
 
@@ -46,12 +47,10 @@ class _Critic(InformationGainEstimator):
         for a, counted in enumerate(simulations.counted):
             rows, action = torch.nonzero(counted)[:, 0], simulations.action[a]
             if len(rows):
-                theta = simulations.theta[rows]
-                of_each = [
-                    self._of_rows(model, x[a, rows], theta, others, action)
-                    for x in simulations.outcomes()
-                ]
-                gain[a, rows] = torch.stack(of_each).mean(0)
+                given = simulations.theta[rows], others, action
+                every = [x[a, rows] for x in simulations.outcomes()]
+                each = [self._of_rows(model, x, *given) for x in every]
+                gain[a, rows] = torch.stack(each).mean(0)
         return gain
 
     def _others(self, simulations: CandidateSimulations, belief: Any) -> Tensor:
@@ -82,14 +81,11 @@ class _Critic(InformationGainEstimator):
         return _Critic._of_rows(self, model, *every, theta, action).reshape(n, m)
 
     def _function(self, model: Any) -> str:
-        for name in self.functions:
-            if hasattr(model, name):
-                return name
-        raise ValueError(
-            f"expected a model with {self.functions[-1]} for {type(self).__name__}; "
-            f"got {type(model).__name__}; pass one that has it, or choose "
-            "estimator='auto'"
-        )
+        known = [name for name in self.functions if hasattr(model, name)]
+        expected = f"a model with {self.functions[-1]} for {type(self).__name__}"
+        advice = "pass one that has it, or choose estimator='auto'"
+        require(bool(known), expected, type(model).__name__, advice)
+        return known[0]
 
 
 def _ordered(
@@ -150,20 +146,19 @@ class RatioGain(_Critic):
     - \log q(x_i | \xi_i)` of every row, shape (n,). Rows of x are NaN where there was
     no measurement.
 
+    Attributes:
+        negligible: Difference to InfoNCE that counts beyond four standard errors, nats.
+
     References:
         Thomas, Dutta, Corander, Kaski & Gutmann, Bayesian Analysis 2022 (LFIRE);
         Kleinegesse, Drovandi & Gutmann, Bayesian Analysis 2021 (the utility).
     """
 
+    negligible: ClassVar[float] = 0.3
+
     @override
     def compared(
-        self,
-        model: Any,
-        simulations: CandidateSimulations,
-        belief: Any,
-        gain: Tensor,
-        *,
-        negligible: float = 0.3,
+        self, model: Any, simulations: CandidateSimulations, belief: Any, gain: Tensor
     ) -> list[str]:
         """Return a caution where InfoNCE, which needs no normalization, is elsewhere.
 
@@ -172,15 +167,14 @@ class RatioGain(_Critic):
             simulations: Simulations that the contributions are of.
             belief: Belief that theta was drawn from.
             gain: Contributions, shape (a, n).
-            negligible: Difference that counts beyond four standard errors, nats.
         """
         other = InfoNCEGain()
         bound = other(model, simulations, belief)
         error = standard_error(bound - gain)
-        apart = (bound - gain).nanmean(1).abs() - negligible - 4 * error
+        apart = (bound - gain).nanmean(1).abs() - self.negligible - 4 * error
         worst = int(apart.nan_to_num(nan=-torch.inf).argmax())
         if not bool(apart[worst] > 0) or other.cautions(bound):
-            return self.cautions(gain)
+            return []
         off = float((bound - gain)[worst].nanmean())
         return [
             f"InfoNCEGain is {abs(off):.1f} nats {'below' if off < 0 else 'above'} at "
@@ -259,8 +253,8 @@ class LikelihoodGain(_Critic):
     ) -> Tensor:
         if belief is None:
             raise ValueError(
-                f"expected a belief for {type(self).__name__} to draw from; got None; "
-                "pass the distribution of theta in the simulations"
+                f"expected a belief for {type(self).__name__}; got None; pass that "
+                "which the parameters were drawn from"
             )
         key = zlib.crc32(simulations.theta.numpy(force=True).tobytes())
         with forked_generators(derive_seed(0, "contrastive", key)):

@@ -133,9 +133,7 @@ def class_members(
         the classes, shape (m, k).
     """
     classes = range(len(enough))
-    members: list[LogDensities] = [
-        lambda new: torch.zeros(len(new), len(classes), dtype=torch.float64)
-    ]
+    members: list[LogDensities] = [lambda new: new.new_zeros(len(new), len(enough))]
     if x.shape[1] == 0 or not bool(enough.all()):
         return members
     reduce = reduction(x, torch.nn.functional.one_hot(label).double())

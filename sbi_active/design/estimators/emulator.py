@@ -88,9 +88,8 @@ class MeanEmulator:
         metric = torch.einsum("nqi,nqj->ij", slope, slope)
         metric = metric / metric.diagonal().mean().clamp_min(1e-30)
         along = torch.linalg.cholesky(metric + 0.01 * torch.eye(len(metric)))
-        chosen = min(
-            first, best(first.transform @ along, bent), key=lambda fit: fit.score
-        )
+        other = best(first.transform @ along, bent)
+        chosen = min(first, other, key=lambda fit: fit.score)
         return MeanEmulator._solve(theta, f, center, chosen.transform, ridges)
 
     @staticmethod
@@ -110,10 +109,8 @@ class MeanEmulator:
             own = inverse @ rest
             missed = own / inverse.diagonal()[:, None]
             better = missed.square().mean(0) < error.square().mean(0)
-            weight, error = (
-                torch.where(better, own, weight),
-                torch.where(better, missed, error),
-            )
+            weight = torch.where(better, own, weight)
+            error = torch.where(better, missed, error)
         return MeanEmulator(center, transform, z, trend, weight, error)
 
     @property
@@ -213,17 +210,11 @@ def learned(simulations: CandidateSimulations) -> Emulated:
     Averages are off by the noise, so that none counts as missed.
     """
     theta = simulations.theta.double()
-    x, again = (
-        torch.where(
-            part.flatten(2).isfinite().all(-1, keepdim=True),
-            part.flatten(2).double(),
-            torch.nan,
-        )
-        for part in simulations.outcomes()
-    )
-    num_actions, n, q = x.shape
+    pairs = torch.stack(simulations.outcomes()).flatten(3).double()
+    pairs = pairs.where(pairs.isfinite().all(-1, keepdim=True), torch.nan)
+    _, num_actions, n, q = pairs.shape
     factor, _ = pair_noise(simulations)
-    average = fill(theta, torch.stack([x, again]).nanmean(0)).mT
+    average = fill(theta, pairs.nanmean(0)).mT
     white = torch.linalg.solve_triangular(factor, average, upper=False).mT
     emulator = MeanEmulator.fit(theta, white.transpose(0, 1).flatten(1), ridges=RIDGES)
     mean = emulator(emulator.knots).reshape(n, num_actions, q).transpose(0, 1)
@@ -241,8 +232,6 @@ def learned(simulations: CandidateSimulations) -> Emulated:
 def fill(theta: Tensor, x: Tensor) -> Tensor:
     """Return outcomes (a, n, q), incomplete ones from the nearest complete one."""
     missing = ~x.isfinite().all(-1)
-    if not bool(missing.any()):
-        return x
     x = x.clone()
     z = theta / theta.std(0).clamp_min(1e-30)
     for a in torch.nonzero(missing.any(1))[:, 0].tolist():

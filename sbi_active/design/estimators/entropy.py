@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
+import numpy as np
 import torch
 from scipy.spatial import KDTree
 from scipy.special import digamma
@@ -114,31 +115,21 @@ class EntropyGain(InformationGainEstimator):
         worst, weight = 0.0, torch.arange(1, white.shape[2] + 1).double().sqrt()
         for own, rows in zip(white, simulations.complete, strict=True):
             # One number is the same where outcomes are, and sorted soon.
-            _, step, size = torch.unique(
-                own[rows] @ weight, return_inverse=True, return_counts=True
-            )
-            share = float(size[(size > 1) & (size <= few * self.num_neighbors)].sum())
-            if share > worst * len(rows) and _are_apart(own[rows], step):
-                worst = share / len(rows)
+            one = (own[rows] @ weight).numpy()
+            _, first, size = np.unique(one, return_index=True, return_counts=True)
+            few_each = (size > 1) & (size <= few * self.num_neighbors)
+            share = size[few_each].sum() / max(len(one), 1)
+            if share > worst:
+                step = own[rows][first]
+                apart = torch.cdist(step, step).fill_diagonal_(torch.inf).amin(1)
+                # else they are the same but for a rounding error
+                worst = share if float(apart.median()) > 1 else worst
         if worst <= most:
             return []
         return [
             f"{worst:.0%} of an action's outcomes are on steps, so few on each that "
             "estimates are too high"
         ]
-
-
-def _are_apart(outcome: Tensor, step: Tensor) -> bool:
-    """Whether most steps are apart by more than the noise, not by a rounding error.
-
-    Args:
-        outcome: Outcomes in deviations of their noise, shape (n, q).
-        step: Number of each one's step, shape (n,).
-    """
-    first = torch.zeros_like(step).scatter_(0, step, torch.arange(len(step)))
-    one = outcome[first[: int(step.max()) + 1]]
-    apart = torch.cdist(one, one).fill_diagonal_(torch.inf).amin(1)
-    return float(apart.median()) > 1
 
 
 def conditional_entropy(

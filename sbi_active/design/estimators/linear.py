@@ -113,8 +113,8 @@ class LinearGain(InformationGainEstimator):
         mean, noise = simulations.mean, simulations.noise
         if mean is None or noise is None:
             raise ValueError(
-                "expected declared noise for LinearGain; got replicates; build "
-                "SimulatorModel(fn, noise=...) around a noise-free fn"
+                "expected declared noise for LinearGain; got replicates; declare it, "
+                "SimulatorModel(fn, noise=...)"
             )
         theta = self.target(simulations.theta).double()
         gain = torch.zeros(mean.shape[:2]).double()  # what is lost tells nothing

@@ -13,6 +13,7 @@ from sbi_active.design.estimators.base import (
     Bound,
     CandidateSimulations,
     InformationGainEstimator,
+    Sampler,
 )
 from sbi_active.design.estimators.densities import (
     MOST_NUMBERS,
@@ -22,6 +23,7 @@ from sbi_active.design.estimators.densities import (
     cross_fit,
     noise_members,
 )
+from sbi_active.expected import require
 from sbi_active.seeding import derive_seed
 
 
@@ -56,11 +58,10 @@ class RivalPredictive(Protocol):
         ...
 
 
-class RivalSampler:
+class RivalSampler(Sampler):
     """Draw outcomes of rival models at candidates, as many of each model.
 
-    It stands in for :class:`.CandidateSampler`:
-    the parameter is the index of the model, shape (n, 1), in turn 0, 1, ..., K - 1.
+    The parameter is the index of the model, shape (n, 1), in turn 0, 1, ..., K - 1.
 
     Args:
         rivals: Models.
@@ -68,34 +69,23 @@ class RivalSampler:
 
     Attributes:
         probability: Probability of the models, shape (K,), float64.
-        others: None: what is pending is no matter of rivals.
-        summaries: None: outcomes are whole.
-        notes: Notes on the draws, none.
-        num_drawn: Outcomes so far.
-        num_missing: 0: rivals lose none.
 
     Raises:
         ValueError: If there are fewer than two rivals, or their probabilities are not
             positive or do not add up to one.
     """
 
-    others, notes = torch.empty(0, 0), ()
-    summaries = None
-    num_missing = 0
-
     def __init__(self, rivals: Sequence[RivalPredictive], seed: int) -> None:
         values = [float(rival.probability) for rival in rivals]
         probability = torch.tensor(values, dtype=torch.float64)
         total = float(probability.sum())
-        if len(values) < 2 or min(values) < 0 or abs(total - 1) > 1e-3:
-            raise ValueError(
-                "expected two or more rivals whose probabilities are not negative and "
-                f"add up to 1; got {values}; normalize them"
-            )
+        are_right = len(values) > 1 and min(values) >= 0 and abs(total - 1) <= 1e-3
+        expected = "two or more rivals of probabilities >= 0 that add up to 1"
+        require(are_right, expected, values, "normalize them")
         # a rival of no probability has no part in the information
         self.rivals = [r for r, p in zip(rivals, values, strict=True) if p > 0]
         self.probability = probability[probability > 0] / total
-        self.seed, self.num_drawn, self._num_waves = seed, 0, 0
+        self.seed = seed
 
     def draw(self, num_samples: int, action: Tensor) -> CandidateSimulations:
         """Draw outcomes.
@@ -116,12 +106,9 @@ class RivalSampler:
         for own in action:
             drawn = [self._predict(k, own, each, seed) for k in range(num_rivals)]
             shapes = [tuple(part.shape) for parts in drawn for part in parts]
-            if len({*shapes}) > 1 or shapes[0][:1] != (each,):
-                raise ValueError(
-                    f"expected {each} outcomes of one shape from all rivals, and such "
-                    f"means and deviations; got {shapes}; return one row a draw, and "
-                    "predict the same x"
-                )
+            are_alike = len({*shapes}) == 1 and shapes[0][:1] == (each,)
+            expected = f"{each} outcomes, means and deviations of one shape a rival"
+            require(are_alike, expected, shapes, "return a row of the same x a draw")
             each_kind = zip(*drawn, strict=False)  # those that all rivals have
             rows.append(torch.stack([torch.stack(kind, 1) for kind in each_kind]))
         every = torch.stack(rows, 1).flatten(2, 3)
@@ -133,10 +120,6 @@ class RivalSampler:
         x, *noise = every if every.ndim > 3 else every[..., None]
         mean, sd = noise or (None, None)
         return CandidateSimulations(index, action, x, mean, sd=sd)
-
-    def rewind(self) -> None:
-        """Repeat the draws of the first call in the next."""
-        self._num_waves = 0
 
     def _predict(self, k: int, action: Tensor, num: int, seed: int) -> list[Tensor]:
         """Return outcomes, and where the rival knows them means and deviations."""

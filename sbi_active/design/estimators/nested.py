@@ -123,8 +123,7 @@ class NestedGain(InformationGainEstimator):
                 "the emulator misses most outcomes of an action by more than the "
                 "noise; slopes of the simulator correct its gain"
             )
-        few = int((~_enough(simulations)).sum())
-        if few:
+        if few := int((~_enough(simulations)).sum()):
             notes.append(
                 f"too few complete outcomes at {few} of {len(simulations.action)} "
                 "actions: only which numbers are present counts, a lower bound"

@@ -144,7 +144,7 @@ def test_where_the_emulator_misses_slopes_of_the_simulator_count():
     """A rough shear keeps volumes: 11.6 nats; without slopes they were thousands."""
     action = torch.zeros(1, 1)
     none = torch.empty(0, 1)
-    sampler = CandidateSampler(SHEAR, PRIOR, action, 0, IN_PROCESS, none, 200, True)
+    sampler = CandidateSampler(SHEAR, PRIOR, action, 0, IN_PROCESS, 200, True, none)
     rows = sampler.draw(300, action)
     assert NestedGain().needs_slopes(rows)
     sloped = sampler.add_slopes(rows)
