@@ -4,8 +4,14 @@ import pytest
 import torch
 from sbi.utils import BoxUniform
 
-from sbi_active import DiscreteActions, GaussianNoise, SimulatorModel, StudentTNoise
-from sbi_active.criticism import Criticism, Effect, Trials
+from sbi_active import (
+    BoxActions,
+    DiscreteActions,
+    GaussianNoise,
+    SimulatorModel,
+    StudentTNoise,
+)
+from sbi_active.criticism import Criticism, Effect, Trials, generic_effects
 from sbi_active.criticism.steps.detection import credible_set
 from tests.criticism.misfit import oscillator
 from tests.effects import normal
@@ -63,6 +69,39 @@ def test_a_slip_along_a_trajectory_is_an_outlier_and_no_process(num, wrong):
     assert loop.misfit() is None
     assert loop.trace().verdict == "outlier"
     assert credible_set(loop.trace().outliers) == (float(wrong),)
+
+
+T = torch.linspace(0.05, 2, 40)
+BAD = {"sign": lambda x: -x, "gain": lambda x: 1.5 * x}
+
+
+def decay(theta, action):
+    return action * torch.exp(-theta[:, 1:] * T) * torch.cos(theta[:, :1] * T)
+
+
+def sweep(theta, action):
+    return theta[:, :1] * torch.sin(action * T * (1 + theta[:, 1:] * T))
+
+
+@pytest.mark.parametrize(
+    ("fn", "truth", "kind", "seed"),
+    [(decay, [3.1, 0.4], "sign", 1), (sweep, [1.5, 0.25], "sign", 2)]
+    + [(sweep, [1.5, 0.25], "gain", 0)],
+)
+def test_a_trial_that_bends_the_fit_to_all_stands_for_no_effect(fn, truth, kind, seed):
+    """Where the fit to all lies the simulator has another slope: a bias was named."""
+    actions = BoxActions(0.3, 2.0)
+    action = actions.sample((6,), seed=seed)
+    model = SimulatorModel(fn, noise=GaussianNoise(0.02), sample_times=T)
+    x = model(torch.tensor([truth]).expand(6, -1), action, seeds=torch.arange(6))
+    wrong = int(action.argmax())
+    x[wrong] = BAD[kind](x[wrong])
+    prior = BoxUniform(torch.tensor([0.5, 0.0]), torch.tensor([6.0, 2.0]))
+    effects = generic_effects(model, actions)
+    given = model, prior, Trials(action, x)
+    found = Criticism(*given, effects=effects, actions=actions).trace()
+    assert found.verdict == "outlier"
+    assert credible_set(found.outliers) == (float(wrong),)
 
 
 def test_what_nothing_explains_ends_no_loop():

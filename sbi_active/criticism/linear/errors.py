@@ -318,7 +318,7 @@ class Errors:
     def _one_trial(
         self, model: LinearModel, grams: Grams, use: NDArray[np.bool_]
     ) -> tuple[Array, Array]:
-        """Return Gram matrices with a process in one trial, whichever it is.
+        """Return Gram matrices with a process in one trial, or what differs in it.
 
         The sensor's error elsewhere is the most probable one by the other trials. A
         gross error needs no fine grid: of the processes some count.
@@ -335,8 +335,12 @@ class Errors:
             return self._one_larger(model, use)
         n, found, weights = len(self.log_sensor), [], []
         shape = len(self.kernels), len(self.times), len(self.sizes)
-        places = n + np.arange(self.num_processes).reshape(shape)
-        some = places[:, ::THINNED, ::THINNED].ravel()
+        places = n + np.arange(len(self.log_prior))
+        process, differs = np.split(places, [self.num_processes])
+        process = process.reshape(shape)[:, ::THINNED, ::THINNED].ravel()
+        parts = [part for part in (process, differs) if len(part)]
+        some = np.concatenate(parts)
+        log_prior = [np.full(len(p), -np.log(len(p) * len(parts))) for p in parts]
         for trial in self.trials:
             at, others = trial & use, ~trial & use
             gram = grams.gram[:n, others].sum(1)
@@ -346,8 +350,8 @@ class Errors:
             log_det = log_det + grams.log_det[some][:, at].sum(1)
             found.append(gram[own] + grams.gram[some][:, at].sum(1))
             weights.append(-0.5 * (log_det + grams.count[use].sum() * LOG_2PI))
-        weight = np.concatenate(weights)
-        return np.concatenate(found), weight - np.log(len(weight))
+        weight = np.array(weights) + np.concatenate(log_prior) - np.log(len(weights))
+        return np.concatenate(found), weight.ravel()
 
     def _one_larger(
         self, model: LinearModel, use: NDArray[np.bool_]

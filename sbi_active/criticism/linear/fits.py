@@ -6,6 +6,7 @@ fit, which whatever is linear rests on.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -199,7 +200,13 @@ def onward(rival: Rival, model: LinearModel, unit: Array, steps: int) -> Array:
     return along_secants(rival, start, wide, steps, known)[0][0]
 
 
-def refitted(rival: Rival, model: LinearModel, unit: Array, kept: Array) -> Array:
+def refitted(
+    rival: Rival,
+    model: LinearModel,
+    unit: Array,
+    kept: Array,
+    near: Sequence[Array] = (),
+) -> Array:
     """Return the best fit of a model to some of the numbers, shape (d,).
 
     Along a valley that the other numbers held closed it takes some ten steps.
@@ -209,14 +216,16 @@ def refitted(rival: Rival, model: LinearModel, unit: Array, kept: Array) -> Arra
         model: The model linearized at its best fit to all.
         unit: Deviations of residuals in a search, shape (N,) or (2 N,).
         kept: Mask of the numbers, shape (N,).
+        near: Places to begin at as well, each of shape (d,).
     """
     wide, kept = unit * missed_by(rival, model.rms), np.resize(kept, len(unit))
 
     def whiten(residual: Array) -> Array:
         return np.where(kept, residual / wide, 0.0)
 
-    start = np.clip(model.u, model.low, model.high)[None]
-    return descend(rival, start, whiten, rival.step, 30)[0][0]
+    start = np.clip([model.u, *near], model.low, model.high)
+    u, cost = descend(rival, start, whiten, rival.step, 30)
+    return u[cost.argmin()]
 
 
 def along_secants(

@@ -43,6 +43,7 @@ class States:
     Attributes:
         search: Search that fits the models.
         chance: Probability of each state that is not the sensor's alone.
+        passes: Tail probability of a chi-square from which a model fits to the sensor.
         fewest: Trials below which none can be told to have a gross error: two that
             agree outvote one.
         num_louder: Draws of effects on the noise, over which their evidence is a mean.
@@ -52,10 +53,12 @@ class States:
 
     search: Search
     chance: float
+    passes: float
     fewest: int = 3
     num_louder: int = 200
     num_outcomes: int = 64
     _known: dict[ModelKey, Mixture] = field(default_factory=dict)
+    _aside: dict[ModelKey, Candidate] = field(default_factory=dict)
     _valid: dict[ModelKey, Array] = field(default_factory=dict)
 
     def keys(self, key: ModelKey) -> dict[ModelKey, float]:
@@ -119,7 +122,7 @@ class States:
         return self._known[key]
 
     def _summed(self, key: ModelKey, use: NDArray[np.bool_] | None) -> Mixture:
-        c, errors = self.search.found[self.predicting(key)], self.search.errors
+        c, errors = self.candidate(key), self.search.errors
         some = np.ones(errors.num_folds, bool) if use is None else use
         gram, log_p = errors.hypotheses(c.model, c.grams, some, key.error)
         timed = self.search.rivals.measurements.is_sequence
@@ -137,6 +140,57 @@ class States:
             gram, log_p = errors.scaled(c.model, scale, some)
         log_p = log_p + self._beside_numbers(c, key.error, some)
         return summed(gram, log_p, c.model)
+
+    def candidate(self, key: ModelKey) -> Candidate:
+        """Return the fitted model that the evidence of a state rests on.
+
+        Where a trial has a gross error it is linearized at the fit to the others: the
+        fit to all may lie where the simulator has another slope.
+
+        Args:
+            key: Effects, and the state of the error.
+        """
+        own = self.search.found[self.predicting(key)]
+        if key.error != OUTLIER or own.model.chi_square[2] >= self.passes:
+            return own
+        if own.model.key not in self._aside:
+            self._aside[own.model.key] = self._set_aside(own)
+        return self._aside[own.model.key]
+
+    def _set_aside(self, own: Candidate) -> Candidate:
+        """Return a model linearized at its fit without a trial, or as it is.
+
+        Which of them explains the trials best is chosen. The trial that the linear
+        model holds to be the one is set aside, and that which errs most.
+
+        Args:
+            own: The model at its fit to all trials.
+        """
+        errors, key, bare = self.search.errors, own.model.key, None
+        if key.effects:
+            bare = self.candidate(ModelKey(error=OUTLIER)).model.u
+        every, found = np.ones(errors.num_folds, bool), []
+        suspects = self._suspects(own)
+        others = (self.search.without(own.model, t, bare) for t in suspects)
+        for c in (own, *others):
+            gram, log_p = errors.hypotheses(c.model, c.grams, every, OUTLIER)
+            found.append((summed(gram, log_p, c.model).log_evidence, c))
+        return max(found, key=lambda pair: pair[0])[1]
+
+    def _suspects(self, own: Candidate) -> list[int]:
+        """Return the trials that may have a gross error by a fit to all of them."""
+        errors = self.search.errors
+        every = np.ones(errors.num_folds, bool)
+        gram, log_p = errors.hypotheses(own.model, own.grams, every, OUTLIER)
+        likeliest = self._by_trial(summed(gram, log_p, own.model)).argmax()
+        _, trial = np.unique(errors.measurements.trial, return_inverse=True)
+        square = own.model.residual[: own.model.num] ** 2
+        worst = (np.bincount(trial, square) / np.bincount(trial)).argmax()
+        return sorted({int(likeliest), int(worst)})
+
+    def _by_trial(self, beside: Mixture) -> Array:
+        """Return the probability that each trial has the gross error, shape (t,)."""
+        return beside.share.reshape(len(self.search.errors.trials), -1).sum(1)
 
     def _beside_numbers(
         self, c: Candidate, error: str | None, use: NDArray[np.bool_]
@@ -233,7 +287,7 @@ class States:
         if own not in self.keys(key):
             return {}
         trials = self._measured
-        share = self.mixture(own).share.reshape(len(trials), -1).sum(1)
+        share = self._by_trial(self.mixture(own))
         order = np.argsort(-share, kind="stable")
         return {float(trials[k]): float(share[k]) for k in order}
 
@@ -249,11 +303,19 @@ class States:
         many = len(self.search.errors.trials) >= self.fewest
         if key not in found or gain < least or not many:
             return ()
-        without = [
-            self.mixture(key, ~own).log_evidence - self.mixture(bare, ~own).log_evidence
-            for own in self.search.errors.trials
-        ]
-        return (*self._measured[np.array(without) < least].tolist(),)
+        without = np.array(
+            [
+                self.mixture(key, ~own).log_evidence
+                - self.mixture(bare, ~own).log_evidence
+                for own in self.search.errors.trials
+            ]
+        )
+        # Without a gross error the fits may lie elsewhere.
+        beside = [self.mixture(ModelKey(k.effects, OUTLIER)) for k in (key, bare)]
+        suspect = self._by_trial(beside[1]).argmax()
+        gain = beside[0].log_evidence - beside[1].log_evidence
+        without[suspect] = min(without[suspect], gain)
+        return (*self._measured[without < least].tolist(),)
 
     @property
     def _measured(self) -> Array:

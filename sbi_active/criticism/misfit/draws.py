@@ -147,6 +147,8 @@ def _linear(
     known = None if use is None else use[search.errors.fold]
     rival = models.rival(key, suspect=found.suspect if key.error == OUTLIER else None)
     model = search.model(states.predicting(key))
+    if not found.is_missed:
+        model = states.candidate(found.beside(key)).model
     seed = derive_seed(models.seed, "linear", str(model.key))
     best, spread = None, None
     linear: Callable[[Array], Array] | None = None

@@ -71,7 +71,7 @@ class Verdict:
 
     def __post_init__(self) -> None:
         self.rivals = self.search.rivals
-        self.states = States(self.search, self.rule.chance)
+        self.states = States(self.search, self.rule.chance, self.rule.passes)
         self.timed = self.rivals.measurements.is_sequence
 
     @cached_property
