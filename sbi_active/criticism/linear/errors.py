@@ -338,7 +338,10 @@ class Errors:
         places = n + np.arange(len(self.log_prior))
         process, differs = np.split(places, [self.num_processes])
         process = process.reshape(shape)[:, ::THINNED, ::THINNED].ravel()
-        parts = [part for part in (process, differs) if len(part)]
+        parts = [process]
+        # Without a time axis a process in a trial is any error of its numbers.
+        if self.measurements.is_sequence and len(differs):
+            parts.append(differs)
         some = np.concatenate(parts)
         log_prior = [np.full(len(p), -np.log(len(p) * len(parts))) for p in parts]
         for trial in self.trials:

@@ -145,13 +145,16 @@ class States:
         """Return the fitted model that the evidence of a state rests on.
 
         Where a trial has a gross error it is linearized at the fit to the others: the
-        fit to all may lie where the simulator has another slope.
+        fit to all may lie where the simulator has another slope. Models with effects
+        are, if such an error is the likeliest state of the bare model.
 
         Args:
             key: Effects, and the state of the error.
         """
         own = self.search.found[self.predicting(key)]
         if key.error != OUTLIER or own.model.chi_square[2] >= self.passes:
+            return own
+        if key.effects and self.likeliest(ModelKey()).error != OUTLIER:
             return own
         if own.model.key not in self._aside:
             self._aside[own.model.key] = self._set_aside(own)
