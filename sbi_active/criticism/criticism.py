@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import cached_property
-from typing import TYPE_CHECKING
 
 from torch.distributions import Distribution
 
@@ -34,8 +33,11 @@ from sbi_active.criticism.misfit.evaluation import evaluate_held_out, evaluate_l
 from sbi_active.criticism.misfit.record import traced
 from sbi_active.criticism.misfit.rule import Rule
 from sbi_active.criticism.misfit.verdict import Verdict, judge
-from sbi_active.criticism.next_action import choose_action
+from sbi_active.criticism.next_action import choose_action, severe_tests
+from sbi_active.criticism.report.report import Report
+from sbi_active.criticism.report.words import blocks
 from sbi_active.criticism.results import (
+    NONE,
     Detection,
     Evaluation,
     NextAction,
@@ -46,11 +48,9 @@ from sbi_active.criticism.rivals.rival_set import RivalSet
 from sbi_active.criticism.steps.equivalence import equivalent_effects, is_large
 from sbi_active.criticism.steps.predictive import NUM_DRAWS, find_residuals
 from sbi_active.expected import suggests
+from sbi_active.messages import Message
 from sbi_active.progress import stage
 from sbi_active.simulation import SimulatorModel
-
-if TYPE_CHECKING:
-    from sbi_active.criticism.report.report import Report
 
 FEWEST_TRIALS = 4  # to leave one out
 #: Posterior draws that predict held-out trials, of models by linear evidence.
@@ -332,12 +332,41 @@ class Criticism:
             exploratory: Whether library or priors were changed after the data were
                 seen; the report then warns of it.
         """
-        from sbi_active.criticism.report.report import report_of
-
         evaluation = self.evaluate() if evaluate else None
-        own = self, evaluation, self._parts[1].held_out
-        options = {"designed": designed, "exploratory": exploratory}
-        return report_of(*own, plan=plan, **options)
+        held_out = self._parts[1].held_out
+        tracing = self.judged(evaluation)
+        is_withdrawn = tracing.refuted is not None or bool(tracing.bounds.replaces)
+        if is_withdrawn and evaluation is not None and held_out is not None:
+            evaluation = evaluate_held_out(self.rivals, tracing, held_out)
+        simulator, prior = self.add(tracing.chosen)
+        space, after, tests = self.actions if plan else None, None, ()
+        next_action = None if space is None else self.next_action()
+        with stage("residuals and tests", show_progress=self.show_progress):
+            residuals = self.residuals()
+            if tracing.verdict != NONE:
+                after = find_residuals(self.rivals, tracing.key)
+            if space is not None:
+                tests = severe_tests(self.rivals, tracing, space)
+        dim = self.trials.action.shape[1]
+        default = [f"action {i + 1}" for i in range(dim)]
+        known = self.actions and self.actions.entry_labels
+        return Report(
+            trials=self.trials,
+            residuals=residuals,
+            residuals_after=after,
+            detection=self.detect(),
+            tracing=tracing,
+            simulator=simulator,
+            prior=prior,
+            evaluation=evaluation,
+            next_action=next_action,
+            action_labels=self.trials.action_labels or known or default,
+            digest=self.digest,
+            severe_tests=tests,
+            designed=designed,
+            exploratory=exploratory,
+            notes=(*map(Message, blocks("notes", compared=self)),),
+        )
 
 
 def _without(trials: Trials, outlying: Sequence[OutlyingTrial]) -> Trials:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from torch import Tensor
 from torch.distributions import Distribution
@@ -15,11 +15,9 @@ from sbi_active.criticism.data.trials import Trials
 from sbi_active.criticism.effects.effect import Effect
 from sbi_active.criticism.experiments.settle import settle
 from sbi_active.criticism.misfit.rule import Rule
+from sbi_active.criticism.report.report import Report
 from sbi_active.expected import suggests
 from sbi_active.simulation import SimulatorModel
-
-if TYPE_CHECKING:
-    from sbi_active.criticism.report.report import Report
 
 
 @suggests

@@ -20,7 +20,7 @@ from sbi_active.criticism.next_action import (
     permitted_candidates,
     severe_tests,
 )
-from sbi_active.criticism.report.contents import Registered
+from sbi_active.criticism.report.contents import COVERAGE, TestedTrial
 from sbi_active.criticism.report.report import Report
 from sbi_active.criticism.results import (
     CATCH_ALLS,
@@ -32,11 +32,8 @@ from sbi_active.criticism.results import (
 from sbi_active.criticism.steps.predictive import predict
 from sbi_active.expected import suggests
 from sbi_active.inference.sampling.weights import normalized
-from sbi_active.messages import Message
 from sbi_active.seeding import derive_seed
 
-#: Probability with which an outcome lies within the registered interval.
-COVERAGE = 0.9
 #: Mean squared error, in sensor variances, that counts as none.
 TINY = 1e-9
 
@@ -111,7 +108,7 @@ def choose(criticism: Criticism, report: Report, settling: Settling) -> Choice |
         return Choice(severe[0], f"tests {report.tracing.model}") if severe else None
 
     chosen = (test() or told()) if is_named else (told() or test())
-    if chosen or report.verdict != UNEXPLAINED or report.action_is_label:
+    if chosen or report.verdict != UNEXPLAINED or report.trials.action_is_label:
         return chosen
     candidates = permitted_candidates(rivals, actions)
     distance = distance_from(rivals.trials.action, candidates)
@@ -119,24 +116,6 @@ def choose(criticism: Criticism, report: Report, settling: Settling) -> Choice |
         return None
     action = candidates[int(distance.argmax())].double().numpy()
     return Choice(action, "shows the residual where no trial was")
-
-
-def failures(report: Report, *, surprising: float = 0.05) -> list[str]:
-    """Return a warning if a verdict stands though its predictions failed.
-
-    As many failures have a probability below .05 if the intervals hold in .9.
-
-    Args:
-        report: Report with the verdict, and the trials that tested it.
-        surprising: Probability of as many failed predictions below which they
-            are a warning.
-    """
-    own = [t for t in report.measured if t.registered.verdict == report.verdict]
-    failed = [f"{t.registered.index:g}" for t in own if not t.held]
-    if stats.binom.sf(len(failed) - 1, len(own), 1 - COVERAGE) >= surprising:
-        return []
-    told = f"SA531 {report.verdict} did not predict trials {', '.join(failed)}"
-    return [f"{told} of {len(own)} that tested it, and is the verdict still"]
 
 
 def unless_unproven(report: Report, remaining: float) -> Report:
@@ -158,16 +137,14 @@ def unless_unproven(report: Report, remaining: float) -> Report:
     named = tuple(n for n in misfit.named if report.left_by(n) <= remaining)
     if named == misfit.named:
         return report
-    new = str(ModelKey(tuple(n for n in misfit.named if n not in named)))
-    said = f"SA533 {new} explains the trials that were run, and did not predict them"
     tracing = replace(
         tracing,
         verdict=str(ModelKey(named)) if named else UNEXPLAINED,
         beside=tuple(n for n in tracing.chosen if n not in named),
         misfit=replace(misfit, named=named),
+        unproven=tuple(n for n in misfit.named if n not in named),
     )
-    warnings = (*report.warnings, Message(f"{said}: run one that tests it"))
-    return replace(report, tracing=tracing, warnings=warnings)
+    return replace(report, tracing=tracing)
 
 
 def is_settled(report: Report, settling: Settling, enough: int = 1) -> bool:
@@ -180,7 +157,7 @@ def is_settled(report: Report, settling: Settling, enough: int = 1) -> bool:
         enough: Number of these that has to be there where effects are named.
     """
     verdict, is_clean = report.verdict, report.verdict == NONE
-    own = [*takewhile(lambda t: t.registered.verdict == verdict, report.measured[::-1])]
+    own = [*takewhile(lambda t: t.verdict == verdict, report.measured[::-1])]
     needed = settling.clean if is_clean else settling.probability
     held = len(own) >= (1 if is_clean else enough) and all(trial.held for trial in own)
     return held and probability_of(report) >= needed
@@ -193,7 +170,7 @@ def register(
     index: float,
     *,
     num_draws: int = 400,
-) -> Registered:
+) -> TestedTrial:
     """Return what the verdict predicts of a trial.
 
     Args:
@@ -218,7 +195,7 @@ def register(
     if spread is not None:
         mean = prediction.middle
         limit = limit_of(spread.square, len(mean)) / spread.scale
-    return Registered(
+    return TestedTrial(
         index=index,
         action=choice.action,
         purpose=choice.purpose,

@@ -21,16 +21,15 @@ from sbi_active.criticism.effects.trial_conditions import unmeasured
 from sbi_active.criticism.experiments.choice import (
     Settling,
     choose,
-    failures,
     is_settled,
     register,
     unless_unproven,
 )
-from sbi_active.criticism.report.contents import Registered, TestedTrial
+from sbi_active.criticism.report.contents import TestedTrial
 from sbi_active.criticism.report.report import Report
 from sbi_active.criticism.results import Array
 from sbi_active.expected import require
-from sbi_active.messages import Explained, Message
+from sbi_active.messages import Explained
 from sbi_active.simulation import SimulatorModel
 
 
@@ -92,7 +91,7 @@ def settle(
     journal.begin(digest=first.digest, num_trials=len(trials))
     tested = journal.tested()
     for trial in tested:
-        trials = with_trial(first.model, trials, trial.registered.action, trial.x)
+        trials = with_trial(first.model, trials, trial.action, trial.x)
     scored = evaluate and bool(trials.held_out_positions)
     while True:
         criticism, report = _verdict(compare, trials, first, tested, evaluate=scored)
@@ -108,18 +107,16 @@ def settle(
         action = torch.from_numpy(choice.action).float()
         x = np.array(torch.as_tensor(real_system(action)), dtype=float)
         journal.write("measured", index=registered.index, x=x)
-        tested.append(TestedTrial(registered=registered, x=x))
+        tested.append(replace(registered, x=x))
         trials = with_trial(first.model, trials, choice.action, x)
-    options = {"evaluate": evaluate, "plan": plan}
-    report = criticism.report(designed=designed or bool(tested), **options)
-    report = replace(report, tested=(*tested,))
+    options = {"evaluate": evaluate, "plan": plan, "designed": designed}
+    report = replace(criticism.report(**options), tested=(*tested,))
     report = unless_unproven(report, criticism.rule.remaining)
     if stopped == "settled" and not is_settled(report, settling):
         stopped = "trials that had no part in it speak against the verdict"
-    verdicts = [*[t.registered.verdict for t in tested], report.verdict]
-    after = (*[replace(t, after=v) for t, v in zip(tested, verdicts[1:], strict=True)],)
-    warnings = (*report.warnings, *map(Message, failures(report)))
-    return replace(report, tested=after, stopped=stopped, warnings=warnings)
+    verdicts = [*[trial.verdict for trial in tested[1:]], report.verdict]
+    after = (*[replace(t, after=v) for t, v in zip(tested, verdicts, strict=False)],)
+    return replace(report, tested=after, stopped=stopped)
 
 
 def with_trial(
@@ -221,25 +218,21 @@ class Journal:
 
     def tested(self) -> list[TestedTrial]:
         """Return the trials that were measured, each with its prediction."""
-        of: dict[float, dict[str, Any]] = {}
+        predicted, found = dict[float, TestedTrial](), list[TestedTrial]()
         for event in self.events:
-            if "index" in event:
-                of.setdefault(event["index"], {})[event["event"]] = event
-        return [
-            TestedTrial(
-                registered=_registered(parts["registered"]),
-                x=np.asarray(parts["measured"]["x"], dtype=float),
-            )
-            for parts in of.values()
-            if "measured" in parts
-        ]
+            if event["event"] == "registered":
+                predicted[event["index"]] = _predicted(event)
+            elif event["event"] == "measured":
+                x = np.asarray(event["x"], dtype=float)
+                found.append(replace(predicted[event["index"]], x=x))
+        return found
 
 
-def _registered(event: dict[str, Any]) -> Registered:
-    own = {f.name: event[f.name] for f in fields(Registered) if f.name in event}
+def _predicted(event: dict[str, Any]) -> TestedTrial:
+    own = {f.name: event[f.name] for f in fields(TestedTrial) if f.name in event}
     arrays = {k: np.asarray(v) for k, v in own.items() if isinstance(v, list)}
-    without = {k: np.asarray(v) for k, v in own.pop("without", {}).items()}
-    return Registered(**{**own, **arrays}, without=without)
+    without = {k: np.asarray(v) for k, v in own.get("without", {}).items()}
+    return TestedTrial(**{**own, **arrays, "without": without})
 
 
 def _read(path: Path) -> list[dict[str, Any]]:

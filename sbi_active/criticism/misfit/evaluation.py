@@ -171,13 +171,14 @@ def summary(
     rows = []
     for metric in METRICS:
         first, second = (_total(s, metric, np.arange(num)) for s in (before, after))
-        low = high = np.nan
+        interval = None
         if num >= 8:
             each = (_total(s, metric, resampled) for s in (before, after))
-            low, high = np.quantile(_contrast(metric, *each), [0.05, 0.95])
+            ends = np.quantile(_contrast(metric, *each), [0.05, 0.95])
+            interval = tuple(ends.tolist())
         ratio = float(_contrast(metric, first, second))
-        rows.append((metric, float(first), float(second), ratio, low, high))
-    columns = ["metric", "before", "after", "ratio", "low", "high"]
+        rows.append((metric, float(first), float(second), ratio, interval))
+    columns = ["metric", "before", "after", "ratio", "interval"]
     return Evaluation(
         scheme=scheme,
         trials=positions,

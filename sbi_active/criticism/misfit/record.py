@@ -21,8 +21,6 @@ from sbi_active.criticism.misfit.scored import weights_by_error
 from sbi_active.criticism.misfit.verdict import Verdict
 from sbi_active.criticism.results import (
     UNEXPLAINED,
-    Estimate,
-    Evidence,
     ModelKey,
     Tracing,
 )
@@ -52,7 +50,7 @@ def traced(
     by_name = {str(key): p for key, p in probabilities.items()}
     helps, named = found.helps, found.named
     error = found.key.error or (UNEXPLAINED if is_missed else None)
-    trials, chosen = rivals.trials, helps if is_missed else named
+    chosen = helps if is_missed else named
     tracing = Tracing(
         verdict=str(ModelKey(named) if named else ModelKey(error=error)),
         chosen=chosen,
@@ -60,11 +58,10 @@ def traced(
         inclusion=found.inclusion,
         credible_set=credible_set(by_name),
         equivalent=(*found.equivalent,),
-        estimates=_estimates(found, evidences),
+        effects=rivals.effects,
         evidences=evidences,
         guesses=_guesses(found),
         beside=tuple(n for n in helps if n not in named),
-        trial_names=dict(zip(trials.index.tolist(), trials.names, strict=True)),
         p_value=found.p_value,
         outliers=found.outliers,
         **(_missing(found, models, held_out) if is_missed else _explaining(found)),
@@ -216,33 +213,6 @@ def _held_out(models: RivalSet, key: ModelKey, held_out: Trials) -> Array:
     prediction = predict(models, held_out, key=key)
     m = prediction.measurements
     return np.sqrt(m.by_channel((m.x - prediction.middle) ** 2))
-
-
-def _estimates(found: Verdict, evidences: dict[str, Evidence]) -> tuple[Estimate, ...]:
-    """Return each effect by the model that has it alone, likeliest first.
-
-    Its phi is the end of the draws, and of the best fit of a model that misses.
-    """
-    bare, estimates = evidences[str(ModelKey())].log_evidence, []
-    for name, effect in found.rivals.effects.items():
-        if name not in evidences:
-            continue
-        own = evidences[name]
-        phi = own.draws[:, -effect.phi_dim :]
-        center = phi.mean(0) if own.best is None else own.best[-effect.phi_dim :]
-        estimate = Estimate(
-            name=name,
-            family=str(effect.family),
-            units=effect.units,
-            describe=effect.describe or "",
-            probability=found.inclusion[name],
-            log_bayes_factor=own.log_evidence - bare,
-            mean=center,
-            sd=phi.std(0),
-            engine=own.engine,
-        )
-        estimates.append(estimate)
-    return (*sorted(estimates, key=lambda e: -e.probability),)
 
 
 def like_the_verdict(
