@@ -135,8 +135,7 @@ class Criticism:
         self.actions, self.trials = actions, trials
         #: Sampling of the trajectories; None if not looked for.
         self.sampling: Sampling | None = None
-        self._parts = model, trials, self.effects
-        self._warm_up = require_warm_up(warm_up, *self._parts[1:])
+        self._warm_up = require_warm_up(warm_up, trials, self.effects)
         #: Trials that every model misses by far more than the others.
         self.set_aside: tuple[OutlyingTrial, ...] = ()
         self._look(thins=thin)
@@ -148,10 +147,8 @@ class Criticism:
         with stage("a look at the simulator", show_progress=self.show_progress):
             rivals = self._models()
             if thins:
-                model, trials, effects = self._parts
-                self.trials, self.sampling = thinned_to_need(rivals, trials)
-                if self.trials is not trials:
-                    self._parts = model, self.trials, effects
+                self.trials, self.sampling = thinned_to_need(rivals, self.trials)
+                if self.sampling is not None and self.sampling.every > 1:
                     rivals = self._models()
             #: Effects that linear evidence set aside; None where all are fitted.
             self._search, self.screening = linear_models(rivals)
@@ -159,8 +156,7 @@ class Criticism:
         self._equivalent: tuple[frozenset[str], ...] | None = None
 
     def _models(self) -> RivalSet:
-        model, trials, effects = self._parts
-        own = model, self.prior, trials.fit, effects
+        own = self.model, self.prior, self.trials.fit, self.effects
         options = {"actions": self.actions, "warm_up": self._warm_up}
         return RivalSet(*own, seed=self.seed, **options)
 
@@ -169,9 +165,7 @@ class Criticism:
         """What the models say, without trials that are not to decide it."""
         found = self._judge()
         if found.is_missed and (outlying := found.outlying()):
-            model, trials, effects = self._parts
             self.set_aside = outlying
-            self._parts = model, _without(trials, outlying), effects
             self.trials = _without(self.trials, outlying)
             self._look(thins=False)
             found = self._judge()
@@ -186,13 +180,6 @@ class Criticism:
     def rivals(self) -> RivalSet:
         """The models; once traced with the posteriors of those that are recorded."""
         return self._traced[1] if "_traced" in vars(self) else self._search.rivals
-
-    def misfit(self) -> Verdict | None:
-        """Return the models where none explains the trials to the sensor's error.
-
-        None if one does, or where the size of that error is not declared.
-        """
-        return self._verdict if self._verdict.is_missed else None
 
     def residuals(self) -> Residuals:
         """Return the residuals of the bare model."""
@@ -228,7 +215,7 @@ class Criticism:
     def _traced(self) -> tuple[Tracing, RivalSet]:
         found = self._verdict
         # Each model's held-out errors would take as much as the verdict.
-        held_out = None if self._is_large else self._parts[1].held_out
+        held_out = None if self._is_large else self.trials.held_out
         with stage("verdict, sets of effects fitted", show_progress=self.show_progress):
             tracing, models = traced(found, held_out)
         return replace(tracing, set_aside=self.set_aside), models
@@ -292,7 +279,7 @@ class Criticism:
 
     @cached_property
     def _evaluation(self) -> Evaluation | None:
-        tracing, trials = self.trace(), self._parts[1]
+        tracing, trials = self.trace(), self.trials
         options = {"num_draws": FEW_DRAWS if self._is_large else NUM_DRAWS}
         if (held_out := trials.held_out) is not None:
             return evaluate_held_out(self.rivals, tracing, held_out, **options)
@@ -333,11 +320,10 @@ class Criticism:
                 seen; the report then warns of it.
         """
         evaluation = self.evaluate() if evaluate else None
-        held_out = self._parts[1].held_out
-        tracing = self.judged(evaluation)
+        tracing, trials = self.judged(evaluation), self.trials
         is_withdrawn = tracing.refuted is not None or bool(tracing.bounds.replaces)
-        if is_withdrawn and evaluation is not None and held_out is not None:
-            evaluation = evaluate_held_out(self.rivals, tracing, held_out)
+        if is_withdrawn and evaluation is not None and trials.held_out is not None:
+            evaluation = evaluate_held_out(self.rivals, tracing, trials.held_out)
         simulator, prior = self.add(tracing.chosen)
         space, after, tests = self.actions if plan else None, None, ()
         next_action = None if space is None else self.next_action()
@@ -347,11 +333,10 @@ class Criticism:
                 after = find_residuals(self.rivals, tracing.key)
             if space is not None:
                 tests = severe_tests(self.rivals, tracing, space)
-        dim = self.trials.action.shape[1]
-        default = [f"action {i + 1}" for i in range(dim)]
-        known = self.actions and self.actions.entry_labels
+        labels = trials.action_labels or (self.actions and self.actions.entry_labels)
+        default = [f"action {i + 1}" for i in range(trials.action.shape[1])]
         return Report(
-            trials=self.trials,
+            trials=trials,
             residuals=residuals,
             residuals_after=after,
             detection=self.detect(),
@@ -360,7 +345,7 @@ class Criticism:
             prior=prior,
             evaluation=evaluation,
             next_action=next_action,
-            action_labels=self.trials.action_labels or known or default,
+            action_labels=labels or default,
             digest=self.digest,
             severe_tests=tests,
             designed=designed,

@@ -174,7 +174,6 @@ class Detection:
         p_value: p-value of that chi-square; anti-conservative where noise is estimated.
         level: Level below which it is an alarm; 0 where something is unknown of the
             noise.
-        null_log_evidence: Log evidence by least squares, nats.
         lower_p_value: Probability of one as small, all parameters taken as determined;
             1 where the size of the noise is not declared.
     """
@@ -185,7 +184,6 @@ class Detection:
     degrees_of_freedom: float
     p_value: float
     level: float
-    null_log_evidence: float
     lower_p_value: float = 1.0
 
     @property
@@ -307,11 +305,10 @@ class Evaluation:
 
     Attributes:
         scheme: "held out" or "leave one out".
-        trials: Positions of the scored trials, shape (s,).
-        before: Values by metric, one value a scored trial, shape (s,): "rmse", "energy
-            score", "log predictive density", "coverage" (share of entries in the
-            central 90 %).
-        after: Values with the effects added, likewise.
+        before: A row a scored trial, with columns "rmse", "energy score", "log
+            predictive density", "coverage" (share of entries in the central 90 %),
+            "square" (sum of squared errors) and "count" of the numbers.
+        after: With the effects added, likewise.
         table: Columns metric, before, after, ratio, interval: RMSE over all scored
             trials, means of the others, ratio after / before (difference for the log
             density and the coverage), and its 90 % bootstrap interval, (low, high),
@@ -321,19 +318,16 @@ class Evaluation:
         p_value: Tail probability of the chi-square of all scored trials under what the
             model with the effects predicts; NaN where the noise is not declared.
         missed: Held-out trials far outside what that model predicts, farthest first.
-        num_numbers: Number of numbers in all scored trials.
     """
 
     scheme: Literal["held out", "leave one out"]
-    trials: Array
-    before: dict[str, Array]
-    after: dict[str, Array]
+    before: pd.DataFrame
+    after: pd.DataFrame
     table: pd.DataFrame
     selected: tuple[str, ...]
     names: tuple[str, ...]
     p_value: float = float("nan")
     missed: tuple[MissedTrial, ...] = ()
-    num_numbers: int = 0
 
     @property
     def rmse(self) -> tuple[float, float]:

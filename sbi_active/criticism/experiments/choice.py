@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from itertools import takewhile
 from typing import Any
@@ -30,7 +30,6 @@ from sbi_active.criticism.results import (
     ModelKey,
 )
 from sbi_active.criticism.steps.predictive import predict
-from sbi_active.expected import suggests
 from sbi_active.inference.sampling.weights import normalized
 from sbi_active.seeding import derive_seed
 
@@ -38,45 +37,10 @@ from sbi_active.seeding import derive_seed
 TINY = 1e-9
 
 
-@suggests
-@dataclass(frozen=True, kw_only=True)
-class Settling:
-    """When a verdict is settled, and when a trial is worth running.
-
-    Attributes:
-        probability: Probability of a verdict that names effects from which it may be
-            settled.
-        clean: Probability of "none" from which it may be: that before any trial. With
-            .9 one clean simulator of eight was tested two or three times for nothing.
-        tests: Trials that a verdict that names effects has to predict: of the aliases
-            of tuning seeds that fall by a trial some predict one, and one two.
-        tells: Information about which model is right that is worth a trial, nats.
-        differs: Difference between the verdict's prediction and that without one of its
-            effects that is worth a trial, in standard deviations of the former.
-    """
-
-    probability: float = 0.9
-    clean: float = 0.5
-    tests: int = 3
-    tells: float = 0.1
-    differs: float = 1.0
-
-
-@dataclass(frozen=True)
-class Choice:
-    """A trial to run.
-
-    Attributes:
-        action: Action, shape (action_dim,).
-        purpose: What it is to tell, in words.
-    """
-
-    action: Array
-    purpose: str
-
-
-def choose(criticism: Criticism, report: Report, settling: Settling) -> Choice | None:
-    """Return the permitted action that puts a verdict to the test most.
+def choose(
+    criticism: Criticism, report: Report, *, tells: float = 0.1, differs: float = 1.0
+) -> tuple[Array, str] | None:
+    """Return the permitted action that tests a verdict most, and what it is to tell.
 
     A verdict that names effects is tested where it matters most that they are there: an
     alias fits the trials so far, and errs where another action tells it from its cause.
@@ -87,26 +51,28 @@ def choose(criticism: Criticism, report: Report, settling: Settling) -> Choice |
     Args:
         criticism: The models, fitted to the trials so far.
         report: Report with their verdict.
-        settling: Least that a trial has to tell.
+        tells: Information about which model is right that is worth a trial, nats.
+        differs: Difference between the verdict's prediction and that without one of its
+            effects that is worth a trial, in standard deviations of the former.
 
     Returns:
         None if no permitted action tells enough.
     """
     rivals, actions = criticism.rivals, criticism.actions
     assert actions is not None
-    is_named = report.verdict not in (NONE, *CATCH_ALLS)
 
-    def told() -> Choice | None:
+    def told() -> tuple[Array, str] | None:
         plan = criticism.next_action(beyond=False)
-        if plan.action is None or np.max(plan.information_gain) < settling.tells:
+        if plan.action is None or np.max(plan.information_gain) < tells:
             return None
-        return Choice(plan.action, f"tells {', '.join(plan.separates)} apart")
+        return plan.action, f"tells {', '.join(plan.separates)} apart"
 
-    def test() -> Choice | None:
+    def test() -> tuple[Array, str] | None:
         tests = severe_tests(rivals, report.tracing, actions, outside=False)
-        severe = [t.action for t in tests if t.difference >= settling.differs]
-        return Choice(severe[0], f"tests {report.tracing.model}") if severe else None
+        severe = [t.action for t in tests if t.difference >= differs]
+        return (severe[0], f"tests {report.tracing.model}") if severe else None
 
+    is_named = report.verdict not in (NONE, *CATCH_ALLS)
     chosen = (test() or told()) if is_named else (told() or test())
     if chosen or report.verdict != UNEXPLAINED or report.trials.action_is_label:
         return chosen
@@ -115,7 +81,7 @@ def choose(criticism: Criticism, report: Report, settling: Settling) -> Choice |
     if not distance.any():
         return None
     action = candidates[int(distance.argmax())].double().numpy()
-    return Choice(action, "shows the residual where no trial was")
+    return action, "shows the residual where no trial was"
 
 
 def unless_unproven(report: Report, remaining: float) -> Report:
@@ -147,26 +113,30 @@ def unless_unproven(report: Report, remaining: float) -> Report:
     return replace(report, tracing=tracing)
 
 
-def is_settled(report: Report, settling: Settling, enough: int = 1) -> bool:
+def is_settled(
+    report: Report, enough: int = 1, *, probability: float = 0.9, clean: float = 0.5
+) -> bool:
     """Return whether a verdict is probable, and predicted what tested it.
 
     Args:
         report: Report with the verdict, and the trials that were run. Those since it
             was reached have to agree with its predictions, and there has to be one.
-        settling: Probabilities that a verdict has to have.
         enough: Number of these that has to be there where effects are named.
+        probability: Probability of a verdict that names effects from which it may be.
+        clean: Probability of "none" from which it may be: that before any trial. With
+            .9 one clean simulator of eight was tested two or three times for nothing.
     """
     verdict, is_clean = report.verdict, report.verdict == NONE
     own = [*takewhile(lambda t: t.verdict == verdict, report.measured[::-1])]
-    needed = settling.clean if is_clean else settling.probability
     held = len(own) >= (1 if is_clean else enough) and all(trial.held for trial in own)
-    return held and probability_of(report) >= needed
+    return held and probability_of(report) >= (clean if is_clean else probability)
 
 
 def register(
     criticism: Criticism,
     report: Report,
-    choice: Choice,
+    action: Array,
+    purpose: str,
     index: float,
     *,
     num_draws: int = 400,
@@ -176,13 +146,14 @@ def register(
     Args:
         criticism: The models, fitted to the trials so far.
         report: Report with their verdict.
-        choice: The trial.
+        action: Action of the trial, shape (action_dim,).
+        purpose: What the trial is to tell.
         index: Place of the trial in the order of execution.
         num_draws: Draws of a registered prediction: its 90 % limit has a
             standard error of 1 %.
     """
     rivals = criticism.rivals
-    trial = following(rivals, torch.from_numpy(choice.action)[None])
+    trial = following(rivals, torch.from_numpy(action)[None])
     trial.index = torch.full_like(trial.index, index)
     seed = derive_seed(rivals.seed, "registered", len(rivals.trials))
     options: dict[str, Any] = {"num_draws": num_draws, "seed": seed, "scored": False}
@@ -197,8 +168,8 @@ def register(
         limit = limit_of(spread.square, len(mean)) / spread.scale
     return TestedTrial(
         index=index,
-        action=choice.action,
-        purpose=choice.purpose,
+        action=action,
+        purpose=purpose,
         verdict=report.verdict,
         mean=mean,
         sd=sd,

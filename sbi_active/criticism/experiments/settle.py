@@ -19,7 +19,6 @@ from sbi_active.criticism.data.arrays import without_inf
 from sbi_active.criticism.data.trials import Trials
 from sbi_active.criticism.effects.trial_conditions import unmeasured
 from sbi_active.criticism.experiments.choice import (
-    Settling,
     choose,
     is_settled,
     register,
@@ -56,9 +55,8 @@ def settle(
     max_trials: int,
     directory: str | Path | None = None,
     evaluate: bool = True,
-    plan: bool = True,
-    designed: bool = False,
-    settling: Settling = Settling(),  # noqa: B008  (frozen)
+    tests: int = 3,
+    **options: bool,
 ) -> Report:
     """Return the report after as many trials as settle its verdict.
 
@@ -75,9 +73,9 @@ def settle(
         directory: Folder that keeps predictions and measurements, from which a loop
             that was interrupted goes on; None keeps them in the report alone.
         evaluate: Whether the report has the error before and after.
-        plan: Whether the report has the action to take next.
-        designed: Whether the trials' actions were chosen for their information.
-        settling: When a verdict is settled.
+        tests: Trials that a verdict that names effects has to predict: of the aliases
+            of tuning seeds that fall by a trial some predict one, and one two.
+        **options: Further options of :meth:`.Criticism.report`.
 
     Raises:
         ValueError: If there are no permitted actions, or the folder belongs to other
@@ -93,26 +91,41 @@ def settle(
     for trial in tested:
         trials = with_trial(first.model, trials, trial.action, trial.x)
     scored = evaluate and bool(trials.held_out_positions)
+
+    def verdict() -> tuple[Criticism, Report]:
+        try:
+            found = compare(trials) if tested else first
+            report = found.report(evaluate=scored, plan=False)
+        except Exception as error:
+            if not tested:
+                raise
+            raise VerdictError(
+                f"expected a verdict on {len(trials)} trials; got {error}; go on from "
+                "the directory, or from .trials of this error",
+                trials,
+            ) from error
+        return found, replace(report, tested=(*tested,))
+
     while True:
-        criticism, report = _verdict(compare, trials, first, tested, evaluate=scored)
-        is_last, choice = len(tested) >= max_trials, None
-        if not (is_last or is_settled(report, settling, settling.tests)):
-            choice = choose(criticism, report, settling)
-        if choice is None:  # fewer tests settle where no action is left
+        criticism, report = verdict()
+        is_last, chosen = len(tested) >= max_trials, None
+        if not (is_last or is_settled(report, tests)):
+            chosen = choose(criticism, report)
+        if chosen is None:  # fewer tests settle where no action is left
             why = "no trials are left" if is_last else "no permitted action tells more"
-            stopped = "settled" if is_settled(report, settling) else why
+            stopped = "settled" if is_settled(report) else why
             break
-        registered = register(criticism, report, choice, _next_index(trials))
+        registered = register(criticism, report, *chosen, _next_index(trials))
         journal.write("registered", **vars(registered))
-        action = torch.from_numpy(choice.action).float()
-        x = np.array(torch.as_tensor(real_system(action)), dtype=float)
+        action = torch.from_numpy(registered.action)
+        x = np.array(torch.as_tensor(real_system(action.float())), dtype=float)
         journal.write("measured", index=registered.index, x=x)
         tested.append(replace(registered, x=x))
-        trials = with_trial(first.model, trials, choice.action, x)
-    options = {"evaluate": evaluate, "plan": plan, "designed": designed}
-    report = replace(criticism.report(**options), tested=(*tested,))
+        trials = with_trial(first.model, trials, registered.action, x)
+    report = criticism.report(evaluate=evaluate, **options)
+    report = replace(report, tested=(*tested,))
     report = unless_unproven(report, criticism.rule.remaining)
-    if stopped == "settled" and not is_settled(report, settling):
+    if stopped == "settled" and not is_settled(report):
         stopped = "trials that had no part in it speak against the verdict"
     verdicts = [*[trial.verdict for trial in tested[1:]], report.verdict]
     after = (*[replace(t, after=v) for t, v in zip(tested, verdicts, strict=False)],)
@@ -145,28 +158,6 @@ def with_trial(
 
 def _next_index(trials: Trials) -> float:
     return float(trials.index.max()) + 1
-
-
-def _verdict(
-    compare: Callable[[Trials], Criticism],
-    trials: Trials,
-    first: Criticism,
-    tested: list[TestedTrial],
-    *,
-    evaluate: bool,
-) -> tuple[Criticism, Report]:
-    try:
-        criticism = compare(trials) if tested else first
-        report = criticism.report(evaluate=evaluate, plan=False)
-    except Exception as error:
-        if not tested:
-            raise
-        raise VerdictError(
-            f"expected a verdict on {len(trials)} trials; got {error}; go on from the "
-            "directory, or from .trials of this error",
-            trials,
-        ) from error
-    return criticism, replace(report, tested=(*tested,))
 
 
 NAME = "trials.jsonl"

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from dataclasses import asdict, dataclass, field
 from functools import partial
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from scipy.stats import binom
@@ -20,16 +20,8 @@ from sbi_active.criticism.results import NONE, OUTLIER
 from sbi_active.criticism.rivals.rival import surprising_outcomes
 from sbi_active.criticism.steps.detection import TOO_SMALL
 
-Decision = Literal[
-    "SHIP",
-    "NO_IMPROVEMENT",
-    "NOT_IDENTIFIABLE",
-    "OUT_OF_PRIOR",
-    "WRONG_MODEL",
-    "NOT_ENOUGH_DATA",
-]
 #: Exit status of a process by decision; 1 and 2 are those of failures and misuse.
-EXIT_CODES: dict[Decision, int] = {
+EXIT_CODES = {
     "SHIP": 0,
     "NO_IMPROVEMENT": 10,
     "NOT_IDENTIFIABLE": 11,
@@ -49,7 +41,7 @@ class Gate:
         details: Effects to add, trials that are missed, bounds to move, combinations.
     """
 
-    decision: Decision
+    decision: str
     reason: str
     details: dict[str, Any] = field(default_factory=dict)
 
@@ -91,7 +83,7 @@ def gate_of(
             declared so large that more may hide in it than is left: half of it.
     """
     scored, decide = report.evaluation, partial(_decided, report)
-    num = 0 if scored is None else len(scored.trials)
+    num = 0 if scored is None else len(scored.names)
     if num >= fewest and (narrow := _beyond_prior(report, level)) is not None:
         return narrow
     if report.verdict == OUTLIER:
@@ -106,7 +98,8 @@ def gate_of(
     # The chi-square that raised no alarm is that of left-out trials too.
     tested = found.level > 0 if folds else np.isfinite(scored.p_value)
     outside = 1 - float(np.mean(scored.after["coverage"]))
-    chance = binom.sf(round(outside * scored.num_numbers) - 1, scored.num_numbers, 0.1)
+    numbers = int(scored.before["count"].to_numpy().sum())
+    chance = binom.sf(round(outside * numbers) - 1, numbers, 0.1)
     uncovered = not tested and outside > 1 - covered and chance < level
     if missed or scored.p_value < level or uncovered:
         details = {"trials": missed, "worst": _worst(report)}
@@ -135,7 +128,7 @@ def gate_of(
 
 def _decided(
     report: Contents,
-    decision: Decision,
+    decision: str,
     case: str,
     details: dict[str, Any],
     **more: Any,

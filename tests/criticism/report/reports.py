@@ -65,8 +65,6 @@ def misfit(left_out, held_out=(None, None), *, sensor=(0.005,)) -> Misfit:
         support={"drag": Support(inclusion=0.9, better=0.9, gained=9.0, remains=0.9)},
         sensor=np.array(sensor),
         passes=False,
-        size=40.0,
-        time_scale=1.0,
     )
 
 

@@ -98,7 +98,7 @@ def forced(*, taken):
 
 
 MISSED = MissedTrial(position=0, name="7", size=60.0, p_value=0.0, by_both=True)
-ASIDE = OutlyingTrial(position=3, name="3", times=9.0, size=50.0)
+ASIDE = OutlyingTrial(position=3, name="3", times=9.0)
 BOUND = BoundParameter(name="mu_1", model="none", side="lower", bound=0.5, beyond=0.4)
 WEAK = {"log_bayes_factor": 1.0, "p_value": 1e-9}
 SORTED = reports.trials(sorted(reports.trials().action[:, 0].tolist()))
