@@ -116,7 +116,8 @@ def settle(
             stopped = "settled" if is_settled(report) else why
             break
         registered = register(criticism, report, *chosen, _next_index(trials))
-        journal.write("registered", **vars(registered))
+        predicted = {k: v for k, v in vars(registered).items() if k != "x"}
+        journal.write("registered", **predicted)
         action = torch.from_numpy(registered.action)
         x = np.array(torch.as_tensor(real_system(action.float())), dtype=float)
         journal.write("measured", index=registered.index, x=x)
@@ -209,21 +210,18 @@ class Journal:
 
     def tested(self) -> list[TestedTrial]:
         """Return the trials that were measured, each with its prediction."""
-        predicted, found = dict[float, TestedTrial](), list[TestedTrial]()
+        trials = dict[float, dict[str, Any]]()
         for event in self.events:
-            if event["event"] == "registered":
-                predicted[event["index"]] = _predicted(event)
-            elif event["event"] == "measured":
-                x = np.asarray(event["x"], dtype=float)
-                found.append(replace(predicted[event["index"]], x=x))
-        return found
+            if "index" in event:
+                trials.setdefault(event["index"], {}).update(event)
+        return [_tested(parts) for parts in trials.values() if "x" in parts]
 
 
-def _predicted(event: dict[str, Any]) -> TestedTrial:
-    own = {f.name: event[f.name] for f in fields(TestedTrial) if f.name in event}
-    arrays = {k: np.asarray(v) for k, v in own.items() if isinstance(v, list)}
-    without = {k: np.asarray(v) for k, v in own.get("without", {}).items()}
-    return TestedTrial(**{**own, **arrays, "without": without})
+def _tested(parts: dict[str, Any]) -> TestedTrial:
+    own = {f.name: parts[f.name] for f in fields(TestedTrial) if f.name in parts}
+    own |= {k: np.asarray(v) for k, v in own.items() if isinstance(v, list)}
+    own["without"] = {k: np.asarray(v) for k, v in own.get("without", {}).items()}
+    return TestedTrial(**{**own, "x": np.asarray(own["x"], dtype=float)})
 
 
 def _read(path: Path) -> list[dict[str, Any]]:
