@@ -19,9 +19,8 @@ class MissedTrial:
     Attributes:
         position: Place among the held-out trials.
         name: Name of the trial in reports.
-        size: Root mean square error; inf if the model is sure of no measurement.
-        unit: Unit of ``size``: sensor deviations, or the simulator's where it is the
-            draw.
+        size: Root mean square error in sensor deviations, or those of the prediction if
+            the simulator is the draw; inf if the model is sure of no measurement.
         p_value: Probability of an error as large, if the model holds.
         by_both: Whether it is as far outside what the bare model predicts.
     """
@@ -31,7 +30,6 @@ class MissedTrial:
     size: float
     p_value: float
     by_both: bool
-    unit: str = "sensor deviations"
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -47,8 +47,7 @@ from sbi_active.criticism.results import (
 from sbi_active.criticism.rivals.rival_set import RivalSet
 from sbi_active.criticism.steps.equivalence import equivalent_effects, is_large
 from sbi_active.criticism.steps.predictive import NUM_DRAWS, find_residuals
-from sbi_active.expected import suggests
-from sbi_active.messages import Message
+from sbi_active.expected import require, suggests
 from sbi_active.progress import stage
 from sbi_active.simulation import SimulatorModel
 
@@ -163,18 +162,16 @@ class Criticism:
     @cached_property
     def _verdict(self) -> Verdict:
         """What the models say, without trials that are not to decide it."""
-        found = self._judge()
-        if found.is_missed and (outlying := found.outlying()):
+        while True:
+            groups = self.equivalent()
+            with stage("models fitted", show_progress=self.show_progress):
+                found = judge(self._search, groups, self.rule)
+            asks = found.is_missed and not self.set_aside
+            if not asks or not (outlying := found.outlying()):
+                return found
             self.set_aside = outlying
             self.trials = _without(self.trials, outlying)
             self._look(thins=False)
-            found = self._judge()
-        return found
-
-    def _judge(self) -> Verdict:
-        groups = self.equivalent()
-        with stage("models fitted", show_progress=self.show_progress):
-            return judge(self._search, groups, self.rule)
 
     @property
     def rivals(self) -> RivalSet:
@@ -234,11 +231,9 @@ class Criticism:
         """
         names = self.trace().chosen if effects is None else (*effects,)
         known = self._search.rivals
-        if lost := {*names} - {e.name for e in known.library}:
-            raise ValueError(
-                f"expected effects among {', '.join(known.effects) or 'none'}; "
-                f"got {', '.join(sorted(lost))}; declare them in Criticism(effects=...)"
-            )
+        lost, advice = {*names} - {e.name for e in known.library}, "declare them"
+        expected = f"effects among {', '.join(known.effects) or 'none'}"
+        require(not lost, expected, ", ".join(sorted(lost)), advice)
         declared = {e.name: e for e in self.effects}
         every = (*names, *[e.name for e in known.nuisances])
         if not (added := [declared[n] for n in every]):
@@ -350,7 +345,7 @@ class Criticism:
             severe_tests=tests,
             designed=designed,
             exploratory=exploratory,
-            notes=(*map(Message, blocks("notes", compared=self)),),
+            notes=(*blocks("notes", compared=self),),
         )
 
 

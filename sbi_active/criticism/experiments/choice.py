@@ -39,8 +39,8 @@ TINY = 1e-9
 
 def choose(
     criticism: Criticism, report: Report, *, tells: float = 0.1, differs: float = 1.0
-) -> tuple[Array, str] | None:
-    """Return the permitted action that tests a verdict most, and what it is to tell.
+) -> Array | None:
+    """Return the permitted action that puts a verdict to the test most.
 
     A verdict that names effects is tested where it matters most that they are there: an
     alias fits the trials so far, and errs where another action tells it from its cause.
@@ -61,27 +61,27 @@ def choose(
     rivals, actions = criticism.rivals, criticism.actions
     assert actions is not None
 
-    def told() -> tuple[Array, str] | None:
+    def told() -> Array | None:
         plan = criticism.next_action(beyond=False)
         if plan.action is None or np.max(plan.information_gain) < tells:
             return None
-        return plan.action, f"tells {', '.join(plan.separates)} apart"
+        return plan.action
 
-    def test() -> tuple[Array, str] | None:
+    def test() -> Array | None:
         tests = severe_tests(rivals, report.tracing, actions, outside=False)
         severe = [t.action for t in tests if t.difference >= differs]
-        return (severe[0], f"tests {report.tracing.model}") if severe else None
+        return severe[0] if severe else None
 
     is_named = report.verdict not in (NONE, *CATCH_ALLS)
-    chosen = (test() or told()) if is_named else (told() or test())
-    if chosen or report.verdict != UNEXPLAINED or report.trials.action_is_label:
-        return chosen
+    for ask in (test, told) if is_named else (told, test):
+        if (action := ask()) is not None:
+            return action
+    if report.verdict != UNEXPLAINED or report.trials.action_is_label:
+        return None
     candidates = permitted_candidates(rivals, actions)
     distance = distance_from(rivals.trials.action, candidates)
-    if not distance.any():
-        return None
     action = candidates[int(distance.argmax())].double().numpy()
-    return action, "shows the residual where no trial was"
+    return action if distance.any() else None
 
 
 def unless_unproven(report: Report, remaining: float) -> Report:
@@ -136,7 +136,6 @@ def register(
     criticism: Criticism,
     report: Report,
     action: Array,
-    purpose: str,
     index: float,
     *,
     num_draws: int = 400,
@@ -147,7 +146,6 @@ def register(
         criticism: The models, fitted to the trials so far.
         report: Report with their verdict.
         action: Action of the trial, shape (action_dim,).
-        purpose: What the trial is to tell.
         index: Place of the trial in the order of execution.
         num_draws: Draws of a registered prediction: its 90 % limit has a
             standard error of 1 %.
@@ -169,7 +167,6 @@ def register(
     return TestedTrial(
         index=index,
         action=action,
-        purpose=purpose,
         verdict=report.verdict,
         mean=mean,
         sd=sd,

@@ -115,7 +115,7 @@ def settle(
             why = "no trials are left" if is_last else "no permitted action tells more"
             stopped = "settled" if is_settled(report) else why
             break
-        registered = register(criticism, report, *chosen, _next_index(trials))
+        registered = register(criticism, report, chosen, _next_index(trials))
         predicted = {k: v for k, v in vars(registered).items() if k != "x"}
         journal.write("registered", **predicted)
         action = torch.from_numpy(registered.action)

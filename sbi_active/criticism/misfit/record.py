@@ -43,7 +43,11 @@ def traced(
     """
     rivals, is_missed = found.rivals, found.is_missed
     probabilities = _tabled(found) if is_missed else found.probabilities
-    models = _with_posteriors(found)
+    fits = {
+        key: shown(found, posterior(found, rivals, key))
+        for key in dict.fromkeys(_recorded(found))
+    }
+    models = rivals.with_fits(fits)
     evidences = {str(key): fit.evidence for key, fit in models.fits.items()}
     by_name = {str(key): p for key, p in probabilities.items()}
     helps, named = found.helps, found.named
@@ -128,13 +132,6 @@ def _recorded(found: Verdict) -> list[ModelKey]:
     louder = [key for key in p if states.louder(key) and p[key] >= SHOWN]
     keys = [*states.keys(ModelKey()), *_shown(found), found.key, *louder, *singles]
     return [key for key in keys if key.error is None or not key.effects]
-
-
-def _with_posteriors(found: Verdict) -> RivalSet:
-    """Return the models with the posteriors of some of them, as they are shown."""
-    models, keys = found.rivals, dict.fromkeys(_recorded(found))
-    fits = {key: shown(found, posterior(found, models, key)) for key in keys}
-    return models.with_fits(fits)
 
 
 def _shown(found: Verdict) -> list[ModelKey]:

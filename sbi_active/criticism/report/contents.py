@@ -30,7 +30,6 @@ from sbi_active.identifiability.known import (
     Combinations,
     combinations_of_draws,
 )
-from sbi_active.messages import Message
 from sbi_active.seeding import forked_generators
 from sbi_active.simulation.model import SimulatorModel
 
@@ -45,7 +44,6 @@ class TestedTrial:
     Attributes:
         index: Place of the trial in the order of execution.
         action: Action of the trial, shape (action_dim,).
-        purpose: What the trial is to tell.
         verdict: Verdict that predicts.
         mean: Predicted numbers, shape (N,), in units of x.
         sd: Their standard deviations, noise included, shape (N,).
@@ -60,7 +58,6 @@ class TestedTrial:
 
     index: float
     action: Array
-    purpose: str
     verdict: str
     mean: Array
     sd: Array
@@ -132,7 +129,7 @@ class Contents:
             most: a permitted action, and one beyond.
         designed: Actions were chosen for their information.
         exploratory: Library or priors were changed after the data were seen.
-        notes: What the comparison left out, a sentence each.
+        notes: What the comparison left out, a code and a sentence each.
         tested: Trials that were run to test the verdict, in order.
         stopped: Reason to run no more of them.
     """
@@ -151,7 +148,7 @@ class Contents:
     digest: str = ""
     designed: bool = False
     exploratory: bool = False
-    notes: tuple[Message, ...] = ()
+    notes: tuple[str, ...] = ()
     tested: tuple[TestedTrial, ...] = ()
     stopped: str = ""
 
@@ -264,6 +261,12 @@ class Contents:
             rows.append(row | {"channel": channels[int(c)], "time": float(times[t, k])})
         table = pd.DataFrame(rows)
         return table.sort_values("deviations", ascending=False, kind="stable")
+
+    @property
+    def worst(self) -> list[Any]:
+        """Rows of that table as dictionaries, without columns that are not known."""
+        known = self.residuals_by_trial.dropna(axis="columns", how="all")
+        return known.to_dict("records")
 
     @property
     def growth(self) -> float | None:

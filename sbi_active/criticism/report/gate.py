@@ -102,7 +102,7 @@ def gate_of(
     chance = binom.sf(round(outside * numbers) - 1, numbers, 0.1)
     uncovered = not tested and outside > 1 - covered and chance < level
     if missed or scored.p_value < level or uncovered:
-        details = {"trials": missed, "worst": _worst(report)}
+        details = {"trials": missed, "worst": report.worst[0]}
         return decide("WRONG_MODEL", "missed", details, num=num)
     rare = surprising_outcomes(report.residuals, level / len(report.residuals.index))
     if odd := [report.residuals.names[k] for kind in rare for k in kind]:
@@ -146,12 +146,6 @@ def _decided(
     return Gate(decision, blocks("gate", **given)[0], details)
 
 
-def _worst(report: Contents) -> dict[str, Any]:
-    """Return the trial with the largest residuals."""
-    table = report.residuals_by_trial.head(1).dropna(axis="columns")
-    return next(iter(table.to_dict("records")), {})
-
-
 def _beyond_prior(report: Contents, level: float, *, kept: float = 0.1) -> Gate | None:
     """Return that the prior is too narrow, if a wider one explains the trials.
 
@@ -182,7 +176,7 @@ def _wrong(report: Contents) -> Gate:
     details = {"effects": effects, "before": before, "after": after}
     if tracing.refuted or (effects and not after < before):
         return _decided(report, "NO_IMPROVEMENT", "no lower", details)
-    details |= {"or": tracing.same if effects else [], "worst": _worst(report)}
+    details |= {"or": tracing.same if effects else [], "worst": report.worst[0]}
     case = "named" if effects and not tracing.beside else "missing"
     return _decided(report, "WRONG_MODEL", case, details)
 

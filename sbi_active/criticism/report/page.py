@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from functools import partial
-from itertools import takewhile
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -17,7 +16,6 @@ from sbi_active.criticism.results import NONE, Array, Tracing
 from sbi_active.display.page import Page, Picture, Section
 from sbi_active.display.panels import plot_residuals
 from sbi_active.display.table import Table, number
-from sbi_active.messages import Message, place
 from sbi_active.plain import with_error
 
 if TYPE_CHECKING:
@@ -48,7 +46,7 @@ def figures(report: Contents) -> dict[str, Figure]:
 def page(report: Contents) -> Page:
     """Return a report as a page, the verdict its title."""
     said, sections = prose(report), list[Section]()
-    line, *summary = head(said)
+    first = next(k for k, block in enumerate(said) if block.startswith("## "))
     worst = report.residuals_by_trial.drop(columns="index").head(WORST)
     header = ["trial", "predicted (90 %)", "measured", "prediction", "verdict", "after"]
     tables = {
@@ -58,7 +56,7 @@ def page(report: Contents) -> Page:
         "Parameters": _parameters(report),
         "Predicted, then measured": Table(header, [*_tested(report)]),
     }
-    for block in said[len(summary) + 1 :]:
+    for block in said[first:]:
         if block.startswith("## "):
             title = block.removeprefix("## ")
             text, items = list[str](), list[str]()
@@ -70,22 +68,15 @@ def page(report: Contents) -> Page:
             items.append(block.removeprefix("- "))
         else:
             text.append(block)
-    return Page(line, sections, [" ".join(summary)])
-
-
-def head(said: Sequence[str]) -> list[str]:
-    """Return the verdict with what limits it, in a line, and four sentences.
-
-    These are what is missing, the error before and after, what is left, what next.
-
-    Args:
-        said: Prose of a report.
-    """
-    return [*takewhile(lambda block: not block.startswith("## "), said)]
+    return Page(said[0], sections, [" ".join(said[1:first])])
 
 
 def prose(report: Contents) -> list[str]:
-    """Return first line, sentences, and sections: titles, paragraphs and items."""
+    """Return first line, four sentences, and sections: titles, paragraphs and items.
+
+    The line has the verdict with what limits it; the sentences say what is missing, the
+    error before and after, what is left, what next.
+    """
     p, plan, tracing = report.probabilities, report.next_action, report.tracing
     gain = [] if plan is None else plan.information_gain
     values = {
@@ -96,18 +87,11 @@ def prose(report: Contents) -> list[str]:
         "left": report.left,
         "rmse": report.before_after.set_index("metric").to_dict("index").get("rmse"),
         "sizes": partial(sizes, report),
-        "cautions": cautions_with_codes(report),
-        "worst": report.residuals_by_trial.to_dict("records"),
+        "cautions": cautions(report),
         "listed_trials": WORST,
         "most_told": float(np.nanmax([0.0, *gain])),
     }
     return blocks("report", report=report, **values)
-
-
-def cautions_with_codes(report: Contents) -> list[tuple[str, str]]:
-    """Return the code and the sentence of each warning, without its place."""
-    each = [(own.code, own) for own in map(Message, cautions(report))]
-    return [(code, own.removesuffix(place(code))) for code, own in each]
 
 
 def sizes(report: Contents, *values: Array) -> str:
@@ -126,13 +110,12 @@ def _forms(tracing: Tracing) -> dict[str, float]:
     chosen = [effects[name] for name in tracing.chosen]
     if p.get(tracing.verdict, 0.0) >= 0.9 or not all(map(is_force, chosen)):
         return {}
+    own = {
+        name: {e.family for n, e in effects.items() if n in name.split(" + ")}
+        for name in p
+    }
     families = {effect.family for effect in chosen}
-
-    def is_one(name: str) -> bool:
-        own = {e.family for n, e in effects.items() if n in name.split(" + ")}
-        return bool(chosen) and families <= own
-
-    return {name: share for name, share in p.items() if is_one(name)}
+    return {name: p[name] for name in p if families and families <= own[name]}
 
 
 def _models(report: Contents) -> Table:
@@ -144,7 +127,6 @@ def _models(report: Contents) -> Table:
     """
     tracing, misfit = report.tracing, report.tracing.misfit
     errors = {} if misfit is None else {m.name: m for m in misfit.models}
-    has_held_out = any(m.held_out is not None for m in errors.values())
     has_p = misfit is not None or not tracing.instead_of
     null, rows = tracing.evidences[NONE].log_evidence, []
     for name, p in tracing.probabilities.items():
@@ -156,14 +138,10 @@ def _models(report: Contents) -> Table:
             phi = f"{', '.join(each)} {effect.units}".strip()
         cells = [name, *[probability(p)] * has_p, phi, f"{round(gain, 1) + 0.0:.1f}"]
         if misfit is not None:
-            error = errors.get(name)
-            each = (error.left_out, error.held_out) if error else (None, None)
-            each = each[: 1 + has_held_out]
-            cells += ["" if own is None else sizes(report, own) for own in each]
+            cells.append(sizes(report, errors[name].left_out) if name in errors else "")
         rows.append((-p if has_p else 0.0, -gain, cells))
     header = ["model", *["P" if misfit is None else "share"] * has_p, "phi", "log BF"]
     header += [] if misfit is None else [f"error on left-out {misfit.left_out}"]
-    header += ["on held-out trials"] * has_held_out
     rows.sort(key=lambda row: row[:2])
     return Table(header, [cells for *_, cells in rows])
 

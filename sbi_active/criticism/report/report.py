@@ -11,7 +11,7 @@ import cloudpickle
 
 from sbi_active.criticism.report.contents import Contents
 from sbi_active.criticism.report.gate import Gate, gate_of
-from sbi_active.criticism.report.page import cautions_with_codes, figures, page
+from sbi_active.criticism.report.page import figures, page
 from sbi_active.criticism.report.words import cautions
 from sbi_active.display.figures import legible
 from sbi_active.display.notebook import card, items
@@ -32,13 +32,13 @@ class Report(Contents):
         return f"Report({page(self).title!r})"
 
     def _repr_html_(self) -> str:
-        made, said = page(self), cautions_with_codes(self)
-        return card(made.title, *made.lead, items([" ".join(pair) for pair in said]))
+        made = page(self)
+        return card(made.title, *made.lead, items(cautions(self)))
 
     @cached_property
     def warnings(self) -> tuple[Message, ...]:
         """What limits the conclusions, a sentence each."""
-        return cautions(self)
+        return (*map(Message, cautions(self)),)
 
     @property
     def gate(self) -> Gate:
@@ -57,7 +57,7 @@ class Report(Contents):
             "verdict": self.verdict,
             "line": made.title,
             "summary": made.lead,
-            "warnings": cautions_with_codes(self),
+            "warnings": [said.split(" ", 1) for said in cautions(self)],
             "chosen": self.tracing.chosen,
             # By the fitted trials alone they would contradict the verdict.
             "probabilities": self.probabilities if holds else None,

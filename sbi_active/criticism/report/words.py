@@ -21,7 +21,6 @@ from sbi_active.criticism.rivals.rival_set import FEW_TRIALS
 from sbi_active.criticism.steps.detection import LEVEL, REFUTED, TOO_SMALL, credible_set
 from sbi_active.display.page import environment
 from sbi_active.display.table import number
-from sbi_active.messages import Message
 from sbi_active.seeding import forked_generators
 from sbi_active.simulation.conditions import parameters_of
 
@@ -65,8 +64,8 @@ def listed(names: Sequence[str], last: str = "and") -> str:
     return f"{', '.join(first)} {last} {end}" if first else end
 
 
-def cautions(report: Contents, *, surprising: float = 0.05) -> tuple[Message, ...]:
-    """Return the cautions that limit the conclusions, a sentence each.
+def cautions(report: Contents, *, surprising: float = 0.05) -> list[str]:
+    """Return the cautions that limit the conclusions, a code and a sentence each.
 
     Args:
         report: Report without them.
@@ -98,7 +97,7 @@ def cautions(report: Contents, *, surprising: float = 0.05) -> tuple[Message, ..
         failed=[] if is_chance else failed,
         num_tests=len(tests),
     )
-    return (*map(Message, dict.fromkeys([*said, *report.notes])),)
+    return [*dict.fromkeys([*said, *report.notes])]
 
 
 def _may_be_force(report: Contents) -> bool:

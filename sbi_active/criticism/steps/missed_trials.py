@@ -80,7 +80,6 @@ def missed_trials(
             size=float(sizes[t]),
             p_value=float(tails[1][t]),
             by_both=bool(tails[0][t] < level / num),
-            unit="of its deviations" if sensor is None else "sensor deviations",
         )
         for t in np.flatnonzero(tails[1] < level / num).tolist()
     ]
