@@ -11,7 +11,6 @@ import numpy as np
 from sbi_active.arrays import Array
 from sbi_active.criticism.contradictions import Misfit, ModelError
 from sbi_active.criticism.data.trials import Trials
-from sbi_active.criticism.linear.model import LinearModel
 from sbi_active.criticism.misfit.contrary import is_left_to_chance, withdrawn
 from sbi_active.criticism.misfit.draws import posterior, shown
 from sbi_active.criticism.misfit.guesses import guess_residual
@@ -209,15 +208,14 @@ def like_the_verdict(
         found: The verdict, whose search has fitted each effect alone.
         chosen: Effects that it adds.
     """
-    search, models, log_z = found.search, dict[str, LinearModel](), dict[str, float]()
-    for name in search.names:
-        key = ModelKey((name,))
-        models[name] = search.model(key)
-        log_z[name] = (
-            search.found[key].beside.log_evidence
-            if found.is_missed
-            else found.states.log_evidence(key)
-        )
+    search, keys = found.search, {n: ModelKey((n,)) for n in found.search.names}
+    models = {name: search.model(key) for name, key in keys.items()}
+    log_z = {
+        name: search.found[key].beside.log_evidence
+        if found.is_missed
+        else found.states.log_evidence(key)
+        for name, key in keys.items()
+    }
     best = max(log_z.values(), default=-np.inf)
     likely = [name for name, value in log_z.items() if value > best - THRESHOLD]
 

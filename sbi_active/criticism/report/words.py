@@ -12,10 +12,9 @@ from scipy.stats import binom, rankdata
 
 from sbi_active.criticism.contradictions import UNDECLARED
 from sbi_active.criticism.data.trials import Trials
-from sbi_active.criticism.effects.effect import Effect
 from sbi_active.criticism.forces.library import is_force
 from sbi_active.criticism.report.contents import COVERAGE, Contents
-from sbi_active.criticism.results import UNEXPLAINED, Array, Residuals
+from sbi_active.criticism.results import UNEXPLAINED, Residuals
 from sbi_active.criticism.rivals.rival import surprising_outcomes
 from sbi_active.criticism.rivals.rival_set import FEW_TRIALS
 from sbi_active.criticism.steps.detection import LEVEL, REFUTED, TOO_SMALL, credible_set
@@ -92,7 +91,7 @@ def cautions(report: Contents, *, surprising: float = 0.05) -> list[str]:
         correlation=_correlation(own),
         refuted=REFUTED,
         too_small=TOO_SMALL,
-        edge=_at_edge(report, getattr(report.prior, "effects", ())),
+        edge=_at_edge(report),
         may_be_force=_may_be_force(report),
         failed=[] if is_chance else failed,
         num_tests=len(tests),
@@ -102,14 +101,11 @@ def cautions(report: Contents, *, surprising: float = 0.05) -> list[str]:
 
 def _may_be_force(report: Contents) -> bool:
     """Return whether the simulator takes forces, misses something, and tried none."""
-    tracing = report.tracing
-    misses = tracing.misfit is not None and not tracing.misfit.passes
-    if not (misses or report.verdict == UNEXPLAINED):
-        return False
-    is_tried = any(map(is_force, tracing.effects.values()))
-    return not is_tried and "force" in {
-        p.name for p in parameters_of(report.simulator.fn)
-    }
+    misfit, tried = report.tracing.misfit, report.tracing.effects.values()
+    misses = misfit is not None and not misfit.passes
+    taken = {p.name for p in parameters_of(report.simulator.fn)}
+    asks = "force" in taken and not any(map(is_force, tried))
+    return asks and (misses or report.verdict == UNEXPLAINED)
 
 
 def _aliased(trials: Trials, *, limit: float = 0.9) -> bool:
@@ -142,24 +138,24 @@ def _correlation(own: Residuals, *, long: int = 10, least: float = 0.3) -> float
     return found if found > max(least, 4 / np.sqrt(num)) else 0.0
 
 
-def _at_edge(report: Contents, effects: Sequence[Effect]) -> list[str]:
-    """Return the effects of the verdict that are at the edge of their prior."""
+def _at_edge(report: Contents, *, edge: float = 0.01) -> list[str]:
+    """Return effects of the verdict at the edge of their prior.
+
+    Their phi is further from the null than almost all of its prior.
+
+    Args:
+        report: Report with the verdict.
+        edge: Share of the prior that is further at most.
+    """
     evidence, found = report.evidence, []
-    for effect in effects:
-        if effect.name in report.tracing.chosen:
-            columns = [evidence.names.index(name) for name in effect.phi_names]
-            if _is_extreme(effect, evidence.draws[:, columns].mean(0)):
-                found.append(effect.name)
+    for effect in map(report.tracing.effects.__getitem__, report.tracing.chosen):
+        columns = [evidence.names.index(name) for name in effect.phi_names]
+        with forked_generators(0, "edge"):
+            draws = effect.sample(2_000).numpy()
+        phi = np.vstack([evidence.draws[:, columns].mean(0), draws])
+        null = effect.null_phi(1).numpy()[0]
+        # From an infinite null the far end is away from it.
+        away = np.where(np.isfinite(null), np.abs(phi - null), -np.sign(null) * phi)
+        if ((away[1:] > away[0]).mean(0) < edge).any():
+            found.append(effect.name)
     return found
-
-
-def _is_extreme(effect: Effect, mean: Array, *, edge: float = 0.01) -> bool:
-    """Return whether phi is further from the null than almost all of its prior."""
-    null = effect.null_phi(1).numpy()[0]
-
-    def away(phi: Array) -> Array:  # from an infinite null the far end is away from it
-        return np.where(np.isfinite(null), np.abs(phi - null), -np.sign(null) * phi)
-
-    with forked_generators(0, "edge"):
-        draws = effect.sample(2_000).numpy()
-    return bool(((away(draws) > away(mean)).mean(0) < edge).any())

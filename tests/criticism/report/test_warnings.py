@@ -5,10 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from sbi.utils import BoxUniform
 
 from sbi_active import SimulatorModel
-from sbi_active.criticism import Trials, close_loop, joint_prior
+from sbi_active.criticism import Trials, close_loop
 from sbi_active.criticism.contradictions import (
     BoundParameter,
     Bounds,
@@ -71,8 +70,7 @@ def pushed(mean):
     evidence = reports.MADE.tracing.evidences["drag"]
     draws = evidence.draws.copy()
     draws[:, -1] += mean - draws[:, -1].mean()
-    prior = joint_prior(BoxUniform(torch.zeros(2), torch.ones(2)), [reports.DRAG])
-    return with_evidence(draws=draws) | {"prior": prior}
+    return with_evidence(draws=draws)
 
 
 def errors(after):
