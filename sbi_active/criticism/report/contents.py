@@ -346,13 +346,11 @@ class Contents:
         if self.trials.action_is_label:
             numbers = self.trials.action[:, 0].tolist()
             names = dict(zip(numbers, self.trials.names, strict=True))
-            return f"the inputs of trial {names.get(float(action[0]), action[0])}"
-        return ", ".join(
-            f"{name} = {value:.4g} {unit}".rstrip()
-            for (name, unit), value in zip(
-                map(split, self.action_labels), action, strict=True
-            )
-        )
+            name = names.get(float(action[0]), f"{action[0]:g}")
+            return f"the inputs of trial {name}"
+        pairs = zip(map(split, self.action_labels), action, strict=True)
+        said = [f"{name} = {value:.4g} {unit}" for (name, unit), value in pairs]
+        return ", ".join(map(str.rstrip, said))
 
 
 def by_channel(x: Array, residuals: Residuals) -> Array:

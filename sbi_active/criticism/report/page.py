@@ -149,9 +149,8 @@ def _models(report: Contents) -> Table:
 def _parameters(report: Contents) -> Table:
     """Return the parameters of the bare model and of that of the verdict."""
     rows = [
-        (name, with_error(*before), with_error(*after))
-        for name, *values in report.parameters.itertuples(index=False)
-        for before, after in [(values[:2], values[2:])]
+        (name, with_error(before, before_sd), with_error(after, after_sd))
+        for name, before, before_sd, after, after_sd in report.parameters.to_numpy()
     ]
     return Table(("parameter", "before", "after"), rows)
 
