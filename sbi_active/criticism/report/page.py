@@ -148,11 +148,13 @@ def _models(report: Contents) -> Table:
 
 def _parameters(report: Contents) -> Table:
     """Return the parameters of the bare model and of that of the verdict."""
-    rows = [
-        (name, with_error(before, before_sd), with_error(after, after_sd))
-        for name, before, before_sd, after, after_sd in report.parameters.to_numpy()
-    ]
-    return Table(("parameter", "before", "after"), rows)
+    units = {n: f" [{e.units}]" for n, e in report.tracing.effects.items() if e.units}
+    table = report.parameters
+    names = [name + units.get(name, "") for name in table["parameter"]]
+    before = map(with_error, table["before"], table["before_sd"])
+    after = map(with_error, table["after"], table["after_sd"])
+    header = ("parameter", "before", "after")
+    return Table(header, [*zip(names, before, after, strict=True)])
 
 
 def _tested(report: Contents) -> Iterator[Sequence[str]]:
