@@ -242,8 +242,7 @@ def row_of(number: int, kind: Kind, design: str, reach: float) -> Row:
     start = time.process_time()
     report = verdict_of(reality, number, design)
     tested = [
-        {"before": trial.registered.verdict, "held": bool(trial.held)}
-        for trial in report.tested
+        {"before": trial.verdict, "held": bool(trial.held)} for trial in report.tested
     ]
     return {
         "size": reality.size,

@@ -97,7 +97,7 @@ report = close_loop(
 )
 print(report.verdict, "-", report.stopped)
 for trial in report.tested:
-    print(trial.registered.purpose, trial.registered.action, *trial.in_words())
+    print(trial.action, *trial.in_words())
 
 # %% [markdown]
 # The report has the same as a table, "Predicted, then measured", and the size of the

@@ -204,14 +204,12 @@ def _warn_outside(trials: Trials, actions: ActionSpace) -> None:
     """Warn of actions that are not permitted; they are simulated all the same."""
     dtype = torch.get_default_dtype()
     outside = ~torch.as_tensor(actions.contains(trials.action.to(dtype)))
-    if not bool(outside.any()):
-        return
-    places = outside.nonzero()[:, 0].tolist()
-    warn(
-        f"SA202 the executed action {trials.action[places[0]].tolist()} of trial "
-        f"{trials.names[places[0]]} is not in {actions} ({trials.called(places)}); it "
-        "is simulated where it was executed",
-    )
+    if places := outside.nonzero()[:, 0].tolist():
+        warn(
+            f"SA202 the executed action {trials.action[places[0]].tolist()} of trial "
+            f"{trials.names[places[0]]} is not in {actions} ({trials.called(places)}); "
+            "it is simulated where it was executed",
+        )
 
 
 def _some_rows(prior: Distribution, trials: Trials) -> tuple[Tensor, Tensor, Tensor]:

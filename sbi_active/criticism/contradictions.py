@@ -19,9 +19,8 @@ class MissedTrial:
     Attributes:
         position: Place among the held-out trials.
         name: Name of the trial in reports.
-        size: Root mean square error; inf if the model is sure of no measurement.
-        unit: Unit of ``size``: sensor deviations, or the simulator's where it is the
-            draw.
+        size: Root mean square error in sensor deviations, or those of the prediction if
+            the simulator is the draw; inf if the model is sure of no measurement.
         p_value: Probability of an error as large, if the model holds.
         by_both: Whether it is as far outside what the bare model predicts.
     """
@@ -31,7 +30,6 @@ class MissedTrial:
     size: float
     p_value: float
     by_both: bool
-    unit: str = "sensor deviations"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,13 +40,11 @@ class OutlyingTrial:
         position: Place among the fitted trials.
         name: Name of the trial in reports.
         times: Error on the fit to the others, in medians of theirs.
-        size: Root mean square of that error, in sensor deviations.
     """
 
     position: int
     name: str
     times: float
-    size: float
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -171,10 +167,6 @@ class Misfit:
             of which another may be the cause.
         sensor: Standard deviation of the sensor by channel, units of x, (c,).
         passes: Whether the chi-square of the verdict passes against the sensor.
-        size: Size of the residual process beside the verdict's model, in sensor
-            deviations.
-        time_scale: Time scale of that process, in the unit of the sample times; NaN
-            where x has no time axis, and each number an error of its own.
         left_out: Units that were left out: "trials" or "parts of trials".
         weights: Weights of models by their errors on left-out parts, where
             probabilities are too sure; by name, largest first, without those that
@@ -189,8 +181,6 @@ class Misfit:
     support: dict[str, Support]
     sensor: Array
     passes: bool
-    size: float
-    time_scale: float
     left_out: str = "trials"
     weights: dict[str, float] = field(default_factory=dict)
     instead: dict[str, tuple[str, ...]] = field(default_factory=dict)

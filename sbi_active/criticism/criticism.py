@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import cached_property
-from typing import TYPE_CHECKING
 
 from torch.distributions import Distribution
 
@@ -34,8 +33,11 @@ from sbi_active.criticism.misfit.evaluation import evaluate_held_out, evaluate_l
 from sbi_active.criticism.misfit.record import traced
 from sbi_active.criticism.misfit.rule import Rule
 from sbi_active.criticism.misfit.verdict import Verdict, judge
-from sbi_active.criticism.next_action import choose_action
+from sbi_active.criticism.next_action import choose_action, severe_tests
+from sbi_active.criticism.report.report import Report
+from sbi_active.criticism.report.words import blocks
 from sbi_active.criticism.results import (
+    NONE,
     Detection,
     Evaluation,
     NextAction,
@@ -45,12 +47,9 @@ from sbi_active.criticism.results import (
 from sbi_active.criticism.rivals.rival_set import RivalSet
 from sbi_active.criticism.steps.equivalence import equivalent_effects, is_large
 from sbi_active.criticism.steps.predictive import NUM_DRAWS, find_residuals
-from sbi_active.expected import suggests
+from sbi_active.expected import require, suggests
 from sbi_active.progress import stage
 from sbi_active.simulation import SimulatorModel
-
-if TYPE_CHECKING:
-    from sbi_active.criticism.report.report import Report
 
 FEWEST_TRIALS = 4  # to leave one out
 #: Posterior draws that predict held-out trials, of models by linear evidence.
@@ -135,8 +134,7 @@ class Criticism:
         self.actions, self.trials = actions, trials
         #: Sampling of the trajectories; None if not looked for.
         self.sampling: Sampling | None = None
-        self._parts = model, trials, self.effects
-        self._warm_up = require_warm_up(warm_up, *self._parts[1:])
+        self._warm_up = require_warm_up(warm_up, trials, self.effects)
         #: Trials that every model misses by far more than the others.
         self.set_aside: tuple[OutlyingTrial, ...] = ()
         self._look(thins=thin)
@@ -148,10 +146,8 @@ class Criticism:
         with stage("a look at the simulator", show_progress=self.show_progress):
             rivals = self._models()
             if thins:
-                model, trials, effects = self._parts
-                self.trials, self.sampling = thinned_to_need(rivals, trials)
-                if self.trials is not trials:
-                    self._parts = model, self.trials, effects
+                self.trials, self.sampling = thinned_to_need(rivals, self.trials)
+                if self.sampling is not None and self.sampling.every > 1:
                     rivals = self._models()
             #: Effects that linear evidence set aside; None where all are fitted.
             self._search, self.screening = linear_models(rivals)
@@ -159,40 +155,28 @@ class Criticism:
         self._equivalent: tuple[frozenset[str], ...] | None = None
 
     def _models(self) -> RivalSet:
-        model, trials, effects = self._parts
-        own = model, self.prior, trials.fit, effects
+        own = self.model, self.prior, self.trials.fit, self.effects
         options = {"actions": self.actions, "warm_up": self._warm_up}
         return RivalSet(*own, seed=self.seed, **options)
 
     @cached_property
     def _verdict(self) -> Verdict:
         """What the models say, without trials that are not to decide it."""
-        found = self._judge()
-        if found.is_missed and (outlying := found.outlying()):
-            model, trials, effects = self._parts
+        while True:
+            groups = self.equivalent()
+            with stage("models fitted", show_progress=self.show_progress):
+                found = judge(self._search, groups, self.rule)
+            asks = found.is_missed and not self.set_aside
+            if not asks or not (outlying := found.outlying()):
+                return found
             self.set_aside = outlying
-            self._parts = model, _without(trials, outlying), effects
             self.trials = _without(self.trials, outlying)
             self._look(thins=False)
-            found = self._judge()
-        return found
-
-    def _judge(self) -> Verdict:
-        groups = self.equivalent()
-        with stage("models fitted", show_progress=self.show_progress):
-            return judge(self._search, groups, self.rule)
 
     @property
     def rivals(self) -> RivalSet:
         """The models; once traced with the posteriors of those that are recorded."""
         return self._traced[1] if "_traced" in vars(self) else self._search.rivals
-
-    def misfit(self) -> Verdict | None:
-        """Return the models where none explains the trials to the sensor's error.
-
-        None if one does, or where the size of that error is not declared.
-        """
-        return self._verdict if self._verdict.is_missed else None
 
     def residuals(self) -> Residuals:
         """Return the residuals of the bare model."""
@@ -228,7 +212,7 @@ class Criticism:
     def _traced(self) -> tuple[Tracing, RivalSet]:
         found = self._verdict
         # Each model's held-out errors would take as much as the verdict.
-        held_out = None if self._is_large else self._parts[1].held_out
+        held_out = None if self._is_large else self.trials.held_out
         with stage("verdict, sets of effects fitted", show_progress=self.show_progress):
             tracing, models = traced(found, held_out)
         return replace(tracing, set_aside=self.set_aside), models
@@ -247,11 +231,9 @@ class Criticism:
         """
         names = self.trace().chosen if effects is None else (*effects,)
         known = self._search.rivals
-        if lost := {*names} - {e.name for e in known.library}:
-            raise ValueError(
-                f"expected effects among {', '.join(known.effects) or 'none'}; "
-                f"got {', '.join(sorted(lost))}; declare them in Criticism(effects=...)"
-            )
+        lost, advice = {*names} - {e.name for e in known.library}, "declare them"
+        expected = f"effects among {', '.join(known.effects) or 'none'}"
+        require(not lost, expected, ", ".join(sorted(lost)), advice)
         declared = {e.name: e for e in self.effects}
         every = (*names, *[e.name for e in known.nuisances])
         if not (added := [declared[n] for n in every]):
@@ -292,7 +274,7 @@ class Criticism:
 
     @cached_property
     def _evaluation(self) -> Evaluation | None:
-        tracing, trials = self.trace(), self._parts[1]
+        tracing, trials = self.trace(), self.trials
         options = {"num_draws": FEW_DRAWS if self._is_large else NUM_DRAWS}
         if (held_out := trials.held_out) is not None:
             return evaluate_held_out(self.rivals, tracing, held_out, **options)
@@ -332,12 +314,39 @@ class Criticism:
             exploratory: Whether library or priors were changed after the data were
                 seen; the report then warns of it.
         """
-        from sbi_active.criticism.report.report import report_of
-
         evaluation = self.evaluate() if evaluate else None
-        own = self, evaluation, self._parts[1].held_out
-        options = {"designed": designed, "exploratory": exploratory}
-        return report_of(*own, plan=plan, **options)
+        tracing, trials = self.judged(evaluation), self.trials
+        is_withdrawn = tracing.refuted is not None or bool(tracing.bounds.replaces)
+        if is_withdrawn and evaluation is not None and trials.held_out is not None:
+            evaluation = evaluate_held_out(self.rivals, tracing, trials.held_out)
+        simulator, prior = self.add(tracing.chosen)
+        space, after, tests = self.actions if plan else None, None, ()
+        next_action = None if space is None else self.next_action()
+        with stage("residuals and tests", show_progress=self.show_progress):
+            residuals = self.residuals()
+            if tracing.verdict != NONE:
+                after = find_residuals(self.rivals, tracing.key)
+            if space is not None:
+                tests = severe_tests(self.rivals, tracing, space)
+        labels = trials.action_labels or (self.actions and self.actions.entry_labels)
+        default = [f"action {i + 1}" for i in range(trials.action.shape[1])]
+        return Report(
+            trials=trials,
+            residuals=residuals,
+            residuals_after=after,
+            detection=self.detect(),
+            tracing=tracing,
+            simulator=simulator,
+            prior=prior,
+            evaluation=evaluation,
+            next_action=next_action,
+            action_labels=labels or default,
+            digest=self.digest,
+            severe_tests=tests,
+            designed=designed,
+            exploratory=exploratory,
+            notes=(*blocks("notes", compared=self),),
+        )
 
 
 def _without(trials: Trials, outlying: Sequence[OutlyingTrial]) -> Trials:

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from torch import Tensor
 from torch.distributions import Distribution
@@ -15,11 +16,9 @@ from sbi_active.criticism.data.trials import Trials
 from sbi_active.criticism.effects.effect import Effect
 from sbi_active.criticism.experiments.settle import settle
 from sbi_active.criticism.misfit.rule import Rule
+from sbi_active.criticism.report.report import Report
 from sbi_active.expected import suggests
 from sbi_active.simulation import SimulatorModel
-
-if TYPE_CHECKING:
-    from sbi_active.criticism.report.report import Report
 
 
 @suggests
@@ -57,21 +56,18 @@ def close_loop(  # noqa: D417  (the rest are those of Criticism)
         directory: Folder that keeps predictions, and measurements before anything else
             is done with them; a loop that was interrupted goes on from it.
     """
-
-    def compare(measured: Trials) -> Criticism:
-        return Criticism(
-            model,
-            prior,
-            measured,
-            effects=effects,
-            actions=actions,
-            warm_up=warm_up,
-            thin=thin,
-            rule=rule,
-            seed=seed,
-            show_progress=show_progress,
-        )
-
+    compare = partial(
+        Criticism,
+        model,
+        prior,
+        effects=effects,
+        actions=actions,
+        warm_up=warm_up,
+        thin=thin,
+        rule=rule,
+        seed=seed,
+        show_progress=show_progress,
+    )
     options: dict[str, Any] = {"evaluate": evaluate, "plan": plan, "designed": designed}
     if real_system is None:
         return compare(trials).report(**options)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import lru_cache, partial
 from typing import Any
 
 import numpy as np
@@ -76,24 +76,21 @@ def simulated(rivals: RivalSet, candidates: Tensor) -> Tensor:
     A simulator may fail in any way beyond the permitted range. Labels of trials have no
     such range.
     """
-    kept = []
     if rivals.trials.action_is_label:
         return candidates[:0]
     candidates = candidates[are_known(rivals.model, rivals.trials, candidates)]
-    with torch.no_grad():
-        for action in candidates:
-            try:
-                prediction = predict(
-                    rivals,
-                    following(rivals, action[None]),
-                    num_draws=4,
-                    scored=False,
-                )
-            except Exception:  # noqa: BLE001  (a user's simulator)
-                continue
-            if np.isfinite(prediction.x).all() and prediction.valid.all():
-                kept.append(action)
-    return torch.stack(kept) if kept else candidates[:0]
+    kept = [_gives_numbers(rivals, action) for action in candidates]
+    return candidates[torch.tensor(kept, dtype=torch.bool)]
+
+
+@torch.no_grad()
+def _gives_numbers(rivals: RivalSet, action: Tensor) -> bool:
+    trial = following(rivals, action[None])
+    try:
+        prediction = predict(rivals, trial, num_draws=4, scored=False)
+    except Exception:  # noqa: BLE001  (a user's simulator)
+        return False
+    return bool(np.isfinite(prediction.x).all() and prediction.valid.all())
 
 
 def following(rivals: RivalSet, candidates: Tensor) -> Trials:
@@ -169,10 +166,8 @@ class PredictedRival:
     def __init__(
         self, rivals: RivalSet, key: ModelKey, probability: float, candidates: Tensor
     ) -> None:
-        self.rivals, self.key, self.probability = rivals, key, probability
-        self.candidates = candidates
-        self._trials = following(rivals, candidates)
-        self._draws: tuple[tuple[int, int], Tensor] | None = None
+        self.probability, self.candidates = probability, candidates
+        self._outcomes = lru_cache(1)(partial(_outcomes, rivals, key, candidates))
 
     def predict(
         self, action: Tensor, num_samples: int, seed: int
@@ -186,30 +181,27 @@ class PredictedRival:
             num_samples: Number of draws n.
             seed: Seed of the draws.
         """
-        if self._draws is None or self._draws[0] != (num_samples, seed):
-            self._draws = (num_samples, seed), self._predict(num_samples, seed)
         same = (self.candidates == action.to(self.candidates)).all(-1)
-        x, mean, sd = self._draws[1][:, :, int(same.int().argmax())]
+        every = self._outcomes(num_samples, seed)
+        x, mean, sd = every[:, :, int(same.int().argmax())]
         return x, mean, sd
 
-    def _predict(self, num_samples: int, seed: int) -> Tensor:
-        """Return outcomes, means and deviations, shape (3, n, a, q).
 
-        Outcomes are NaN where there is none.
-        """
-        prediction = predict(
-            self.rivals,
-            self._trials,
-            key=self.key,
-            num_draws=num_samples,
-            seed=seed,
-            scored=False,
-        )
-        trial = prediction.measurements.trial
-        x = np.where(prediction.valid[:, trial], prediction.x, np.nan)
-        every = np.stack([x, prediction.mean, prediction.sd])
-        each = [np.flatnonzero(trial == t) for t in range(len(self._trials))]
-        return torch.from_numpy(np.stack([every[:, :, at] for at in each], 2))
+def _outcomes(
+    rivals: RivalSet, key: ModelKey, candidates: Tensor, num_samples: int, seed: int
+) -> Tensor:
+    """Return outcomes, means and deviations, shape (3, n, a, q).
+
+    Outcomes are NaN where there is none.
+    """
+    trials = following(rivals, candidates)
+    options = {"num_draws": num_samples, "seed": seed, "scored": False}
+    prediction = predict(rivals, trials, key=key, **options)
+    trial = prediction.measurements.trial
+    x = np.where(prediction.valid[:, trial], prediction.x, np.nan)
+    every = np.stack([x, prediction.mean, prediction.sd])
+    each = [np.flatnonzero(trial == t) for t in range(len(trials))]
+    return torch.from_numpy(np.stack([every[:, :, at] for at in each], 2))
 
 
 def choose_action(

@@ -16,6 +16,7 @@ from sbi_active.criticism.contradictions import (
     OutlyingTrial,
 )
 from sbi_active.criticism.data.measurements import shared_errors
+from sbi_active.criticism.effects.effect import Effect
 
 #: What is no effect: the bare model, the residual process, noise inflation, and a gross
 #: error of one trial.
@@ -85,7 +86,7 @@ class Residuals:
         roughness: Deviation of the simulator, which jumps, from any smooth function of
             its parameters, shape of x; it counts as noise here. None if it is
             smooth.
-        names: Names of the trials; empty for positions from 0.
+        names: Names of the trials.
     """
 
     action: Array
@@ -97,9 +98,9 @@ class Residuals:
     refitted: Array
     correlation: float
     noise: Literal["declared", "estimated", "stochastic"]
+    names: tuple[str, ...]
     probability_valid: Array | None = None
     roughness: Array | None = None
-    names: tuple[str, ...] = ()
 
     @property
     def alike(self) -> float:
@@ -112,10 +113,6 @@ class Residuals:
         own = np.stack([np.broadcast_to(place, z.shape) for place in places])
         seen = np.isfinite(z)
         return shared_errors(z[seen], own[:, seen])[1]
-
-    def called(self, position: int) -> str:
-        """Return the name of a trial, or its position without names."""
-        return self.names[position] if self.names else str(position)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -152,6 +149,17 @@ class Evidence:
         """Name of the model in reports."""
         return str(self.key)
 
+    @property
+    def moments(self) -> dict[str, tuple[float, float]]:
+        """Mean and deviation of each coordinate; the best fit of a model that misses.
+
+        Draws of that are within the prior: their mean is no fit.
+        """
+        num = len(self.names)  # beyond these there may be draws of errors
+        center = self.draws[:, :num].mean(0) if self.best is None else self.best[:num]
+        pairs = zip(center.tolist(), self.draws.std(0).tolist(), strict=False)
+        return dict(zip(self.names, pairs, strict=False))
+
 
 @dataclass(frozen=True, kw_only=True)
 class Detection:
@@ -166,7 +174,6 @@ class Detection:
         p_value: p-value of that chi-square; anti-conservative where noise is estimated.
         level: Level below which it is an alarm; 0 where something is unknown of the
             noise.
-        null_log_evidence: Log evidence by least squares, nats.
         lower_p_value: Probability of one as small, all parameters taken as determined;
             1 where the size of the noise is not declared.
     """
@@ -177,7 +184,6 @@ class Detection:
     degrees_of_freedom: float
     p_value: float
     level: float
-    null_log_evidence: float
     lower_p_value: float = 1.0
 
     @property
@@ -194,34 +200,6 @@ class Detection:
     def by_chi_square(self) -> bool:
         """Whether the chi-square raises the alarm."""
         return self.p_value < self.level
-
-
-@dataclass(frozen=True, kw_only=True)
-class Estimate:
-    """One effect as the data leave it.
-
-    Attributes:
-        name: Name of the effect.
-        family: Family of the effect.
-        units: Units of phi.
-        describe: Sentence of the effect, or "".
-        probability: Probability that the simulator lacks the effect, alone or with
-            others.
-        log_bayes_factor: Log Bayes factor of the effect alone against the bare model.
-        mean: Mean of phi given the effect alone, shape (phi_dim,).
-        sd: Standard deviation of phi given the effect alone, shape (phi_dim,).
-        engine: Engine that gave its evidence.
-    """
-
-    name: str
-    family: str
-    units: str
-    describe: str
-    probability: float
-    log_bayes_factor: float
-    mean: Array
-    sd: Array
-    engine: str
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -244,7 +222,7 @@ class Tracing:
             the data about as well (log evidence within log 20 of the best) with
             predictions of the trials closer than the noise; another action, or repeated
             trials, may separate them.
-        estimates: Estimates, one an effect, most probable first.
+        effects: Effects that were compared, by name.
         evidences: Evidence of every model tried, by name. Priors of effects have
             unknown scale.
         guesses: Formula effects, best first: (formula, log evidence above
@@ -264,7 +242,6 @@ class Tracing:
         misfit: Account of the misfit if every model misses by more than the sensor's
             error. Effects that help are then ``chosen``, those that are probably the
             cause are the verdict, and the rest stand in ``beside``.
-        trial_names: Names of the trials by index; others are called by their index.
         stand_in: Reasons why forces of the dictionary that are chosen only stand in for
             something that was not declared, a clause each; empty if they may be it.
         p_value: Tail probability of the chi-square of the verdict's model, its
@@ -273,6 +250,8 @@ class Tracing:
         bounds: Parameters at bounds of the prior, and what a wider one would give.
         set_aside: Trials that every model misses by far more than the others, and that
             had no part in this.
+        unproven: Effects that the rule names with the trials among the data that were
+            run to test them, and that did not predict these.
     """
 
     verdict: str
@@ -281,7 +260,7 @@ class Tracing:
     inclusion: dict[str, float]
     credible_set: tuple[str, ...]
     equivalent: tuple[frozenset[str], ...]
-    estimates: tuple[Estimate, ...]
+    effects: dict[str, Effect]
     evidences: dict[str, Evidence]
     guesses: tuple[tuple[str, float], ...] = ()
     beside: tuple[str, ...] = ()
@@ -291,12 +270,12 @@ class Tracing:
     refuted: tuple[float, float] | None = None
     refuted_on: str = ""
     misfit: Misfit | None = None
-    trial_names: dict[float, str] = field(default_factory=dict)
     stand_in: tuple[str, ...] = ()
     p_value: float = float("nan")
     log_process: float = -float("inf")
     bounds: Bounds = Bounds()
     set_aside: tuple[OutlyingTrial, ...] = ()
+    unproven: tuple[str, ...] = ()
     aliases: tuple[frozenset[str], ...] = ()
 
     @property
@@ -312,9 +291,12 @@ class Tracing:
         """Name of the verdict's model in reports."""
         return self.verdict if self.misfit is None else str(self.key)
 
-    def has_several(self, name: str) -> bool:
-        """Return whether a name in ``probabilities`` is that of several effects."""
-        return name not in (NONE, *CATCH_ALLS, *self.inclusion)
+    @property
+    def same(self) -> list[str]:
+        """The other names that no permitted action tells from the verdict."""
+        own = {*(self.chosen or [self.verdict])}
+        groups = [group for group in self.equivalent if group & own]
+        return sorted(frozenset().union(*groups) - own)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -323,33 +305,29 @@ class Evaluation:
 
     Attributes:
         scheme: "held out" or "leave one out".
-        trials: Positions of the scored trials, shape (s,).
-        before: Values by metric, one value a scored trial, shape (s,): "rmse", "energy
-            score", "log predictive density", "coverage" (share of entries in the
-            central 90 %).
-        after: Values with the effects added, likewise.
-        table: Columns metric, before, after, ratio, low, high: RMSE over all scored
+        before: A row a scored trial, with columns "rmse", "energy score", "log
+            predictive density", "coverage" (share of entries in the central 90 %),
+            "square" (sum of squared errors) and "count" of the numbers.
+        after: With the effects added, likewise.
+        table: Columns metric, before, after, ratio, interval: RMSE over all scored
             trials, means of the others, ratio after / before (difference for the log
-            density and the coverage), and its 90 % bootstrap interval, paired over
-            trials; NaN below 8 trials.
+            density and the coverage), and its 90 % bootstrap interval, (low, high),
+            paired over trials; None below 8 trials.
         selected: Verdict of each fold, shape (s,).
-        names: Names of the scored trials; empty for their positions.
+        names: Names of the scored trials.
         p_value: Tail probability of the chi-square of all scored trials under what the
             model with the effects predicts; NaN where the noise is not declared.
         missed: Held-out trials far outside what that model predicts, farthest first.
-        num_numbers: Number of numbers in all scored trials.
     """
 
     scheme: Literal["held out", "leave one out"]
-    trials: Array
-    before: dict[str, Array]
-    after: dict[str, Array]
+    before: pd.DataFrame
+    after: pd.DataFrame
     table: pd.DataFrame
-    selected: tuple[str, ...] = ()
-    names: tuple[str, ...] = ()
+    selected: tuple[str, ...]
+    names: tuple[str, ...]
     p_value: float = float("nan")
     missed: tuple[MissedTrial, ...] = ()
-    num_numbers: int = 0
 
     @property
     def rmse(self) -> tuple[float, float]:

@@ -1,8 +1,8 @@
-"""Panels of a figure: a design, residuals of trials, scores before and after."""
+"""Panels of a figure: a design, and residuals of trials before and after."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -57,45 +57,6 @@ def plot_residuals(
         for ax in line:
             _residual_axis(ax, each)
         line[0].set_ylabel(f"{title}\nresidual [sd]", color=color)
-    return figure
-
-
-def plot_scores(
-    scores: Mapping[str, tuple[Array, Array]],
-    *,
-    errors: Collection[str],
-    levels: Mapping[str, float],
-) -> Figure:
-    """Draw every score of every scored trial before and after, paired.
-
-    Args:
-        scores: Scores of each trial, shape (2, s), before and after, and those over all
-            trials, shape (2,), by their titles.
-        errors: Titles of those that are errors, whose axis begins at zero.
-        levels: Values that scores should have, by title.
-
-    Returns:
-        The figure.
-    """
-    figure, axes = _subplots(1, len(scores), width=2.5, height=2.7)
-    for ax, (title, (pairs, total)) in zip(axes[0], scores.items(), strict=True):
-        ax.plot([0, 1], pairs, color=FAINT, lw=0.8, alpha=0.7, zorder=1)
-        for x, color in enumerate((BEFORE, AFTER)):
-            places = np.full(pairs.shape[1], x)
-            ax.plot(places, pairs[x], ".", ms=5, color=color, alpha=0.6)
-            ax.plot(x, total[x], "k_", ms=22, mew=2, zorder=3)
-        if title in errors:
-            positive = pairs[np.isfinite(pairs) & (pairs > 0)]
-            is_wide = positive.size and positive.max() > 10 * positive.min()
-            ax.set(yscale="log") if is_wide else ax.set_ylim(bottom=0)
-        elif np.nanmin(pairs) < -200:
-            ax.set_yscale("symlog", linthresh=10)
-        if title in levels:
-            ax.axhline(levels[title], color="#333333", lw=0.8, ls=":")
-            ax.set_ylim(-0.04, 1.04)  # of a share
-        ax.set(xlim=(-0.5, 1.5), xticks=[0, 1], xticklabels=["before", "after"])
-        ax.set_title(title, fontsize=9)
-        _plain(ax)
     return figure
 
 

@@ -82,7 +82,9 @@ class Table:
 
 def number(value: float | None) -> str:
     """Return a number in a few digits, "" for none."""
-    return "" if value is None or value != value else f"{value:.3g}"
+    if value is None or value != value:
+        return ""
+    return f"{value:.0f}" if 1e3 <= abs(value) < 1e6 else f"{value:.3g}"
 
 
 def within(
@@ -118,4 +120,6 @@ def _lines(header: Sequence[Any], rows: Iterable[Sequence[Any]]) -> Iterator[str
 def _cell(value: Any) -> str:
     if isinstance(value, float):
         return "" if value != value else f"{value:.4g}"
+    if isinstance(value, tuple):
+        return " to ".join(map(_cell, value))
     return "" if value is None else f"{value!s:.60}"

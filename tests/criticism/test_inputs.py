@@ -15,7 +15,7 @@ from sbi_active.criticism import (
 )
 from sbi_active.criticism.data.measurements import Measurements
 from sbi_active.criticism.linear.screening import Sampling, suggested_sampling, thinned
-from sbi_active.criticism.report.sections import figures
+from sbi_active.criticism.report.page import figures
 from sbi_active.criticism.rivals.trial_simulator import TrialSimulator
 from sbi_active.simulation import AutocorrelatedNoise, GaussianNoise, SimulatorModel
 from tests.criticism.motor_world import LIBRARY, MODEL, PRIOR, measured

@@ -66,7 +66,7 @@ def test_a_slip_along_a_trajectory_is_an_outlier_and_no_process(num, wrong):
     own = oscillator.trials(action=oscillator.ACTION[:num])
     own.x[wrong] /= 100  # metres for centimetres
     loop = Criticism(oscillator.MODEL, oscillator.PRIOR, own)
-    assert loop.misfit() is None
+    assert loop.trace().misfit is None
     assert loop.trace().verdict == "outlier"
     assert credible_set(loop.trace().outliers) == (float(wrong),)
 

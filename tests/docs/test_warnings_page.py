@@ -71,8 +71,8 @@ def test_codes_are_those_of_the_registry():
     }
     doubts = importlib.import_module("sbi_active.inference.declared.diagnosing")
     said |= {text[:5] for text in doubts.texts().values()}
-    cautions = LIBRARY / "criticism" / "report" / "cautions.jinja"
-    said |= {*re.findall(r"SA\d{3}", cautions.read_text(encoding="utf-8"))}
+    for template in (LIBRARY / "criticism" / "report").glob("*.jinja"):
+        said |= {*re.findall(r"SA\d{3}", template.read_text(encoding="utf-8"))}
     assert said == {*messages.explanations()}
     headings = re.findall("^### .*", (LIBRARY / "messages.md").read_text(), re.M)
     assert len(headings) == len(said)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from itertools import takewhile
 from typing import Any
@@ -20,7 +20,7 @@ from sbi_active.criticism.next_action import (
     permitted_candidates,
     severe_tests,
 )
-from sbi_active.criticism.report.contents import Registered
+from sbi_active.criticism.report.contents import COVERAGE, TestedTrial
 from sbi_active.criticism.report.report import Report
 from sbi_active.criticism.results import (
     CATCH_ALLS,
@@ -30,55 +30,16 @@ from sbi_active.criticism.results import (
     ModelKey,
 )
 from sbi_active.criticism.steps.predictive import predict
-from sbi_active.expected import suggests
 from sbi_active.inference.sampling.weights import normalized
-from sbi_active.messages import Message
 from sbi_active.seeding import derive_seed
 
-#: Probability with which an outcome lies within the registered interval.
-COVERAGE = 0.9
 #: Mean squared error, in sensor variances, that counts as none.
 TINY = 1e-9
 
 
-@suggests
-@dataclass(frozen=True, kw_only=True)
-class Settling:
-    """When a verdict is settled, and when a trial is worth running.
-
-    Attributes:
-        probability: Probability of a verdict that names effects from which it may be
-            settled.
-        clean: Probability of "none" from which it may be: that before any trial. With
-            .9 one clean simulator of eight was tested two or three times for nothing.
-        tests: Trials that a verdict that names effects has to predict: of the aliases
-            of tuning seeds that fall by a trial some predict one, and one two.
-        tells: Information about which model is right that is worth a trial, nats.
-        differs: Difference between the verdict's prediction and that without one of its
-            effects that is worth a trial, in standard deviations of the former.
-    """
-
-    probability: float = 0.9
-    clean: float = 0.5
-    tests: int = 3
-    tells: float = 0.1
-    differs: float = 1.0
-
-
-@dataclass(frozen=True)
-class Choice:
-    """A trial to run.
-
-    Attributes:
-        action: Action, shape (action_dim,).
-        purpose: What it is to tell, in words.
-    """
-
-    action: Array
-    purpose: str
-
-
-def choose(criticism: Criticism, report: Report, settling: Settling) -> Choice | None:
+def choose(
+    criticism: Criticism, report: Report, *, tells: float = 0.1, differs: float = 1.0
+) -> Array | None:
     """Return the permitted action that puts a verdict to the test most.
 
     A verdict that names effects is tested where it matters most that they are there: an
@@ -90,53 +51,37 @@ def choose(criticism: Criticism, report: Report, settling: Settling) -> Choice |
     Args:
         criticism: The models, fitted to the trials so far.
         report: Report with their verdict.
-        settling: Least that a trial has to tell.
+        tells: Information about which model is right that is worth a trial, nats.
+        differs: Difference between the verdict's prediction and that without one of its
+            effects that is worth a trial, in standard deviations of the former.
 
     Returns:
         None if no permitted action tells enough.
     """
     rivals, actions = criticism.rivals, criticism.actions
     assert actions is not None
-    is_named = report.verdict not in (NONE, *CATCH_ALLS)
 
-    def told() -> Choice | None:
+    def told() -> Array | None:
         plan = criticism.next_action(beyond=False)
-        if plan.action is None or np.max(plan.information_gain) < settling.tells:
+        if plan.action is None or np.max(plan.information_gain) < tells:
             return None
-        return Choice(plan.action, f"tells {', '.join(plan.separates)} apart")
+        return plan.action
 
-    def test() -> Choice | None:
+    def test() -> Array | None:
         tests = severe_tests(rivals, report.tracing, actions, outside=False)
-        severe = [t.action for t in tests if t.difference >= settling.differs]
-        return Choice(severe[0], f"tests {report.tracing.model}") if severe else None
+        severe = [t.action for t in tests if t.difference >= differs]
+        return severe[0] if severe else None
 
-    chosen = (test() or told()) if is_named else (told() or test())
-    if chosen or report.verdict != UNEXPLAINED or report.action_is_label:
-        return chosen
+    is_named = report.verdict not in (NONE, *CATCH_ALLS)
+    for ask in (test, told) if is_named else (told, test):
+        if (action := ask()) is not None:
+            return action
+    if report.verdict != UNEXPLAINED or report.trials.action_is_label:
+        return None
     candidates = permitted_candidates(rivals, actions)
     distance = distance_from(rivals.trials.action, candidates)
-    if not distance.any():
-        return None
     action = candidates[int(distance.argmax())].double().numpy()
-    return Choice(action, "shows the residual where no trial was")
-
-
-def failures(report: Report, *, surprising: float = 0.05) -> list[str]:
-    """Return a warning if a verdict stands though its predictions failed.
-
-    As many failures have a probability below .05 if the intervals hold in .9.
-
-    Args:
-        report: Report with the verdict, and the trials that tested it.
-        surprising: Probability of as many failed predictions below which they
-            are a warning.
-    """
-    own = [t for t in report.measured if t.registered.verdict == report.verdict]
-    failed = [f"{t.registered.index:g}" for t in own if not t.held]
-    if stats.binom.sf(len(failed) - 1, len(own), 1 - COVERAGE) >= surprising:
-        return []
-    told = f"SA531 {report.verdict} did not predict trials {', '.join(failed)}"
-    return [f"{told} of {len(own)} that tested it, and is the verdict still"]
+    return action if distance.any() else None
 
 
 def unless_unproven(report: Report, remaining: float) -> Report:
@@ -158,54 +103,55 @@ def unless_unproven(report: Report, remaining: float) -> Report:
     named = tuple(n for n in misfit.named if report.left_by(n) <= remaining)
     if named == misfit.named:
         return report
-    new = str(ModelKey(tuple(n for n in misfit.named if n not in named)))
-    said = f"SA533 {new} explains the trials that were run, and did not predict them"
     tracing = replace(
         tracing,
         verdict=str(ModelKey(named)) if named else UNEXPLAINED,
         beside=tuple(n for n in tracing.chosen if n not in named),
         misfit=replace(misfit, named=named),
+        unproven=tuple(n for n in misfit.named if n not in named),
     )
-    warnings = (*report.warnings, Message(f"{said}: run one that tests it"))
-    return replace(report, tracing=tracing, warnings=warnings)
+    return replace(report, tracing=tracing)
 
 
-def is_settled(report: Report, settling: Settling, enough: int = 1) -> bool:
+def is_settled(
+    report: Report, enough: int = 1, *, probability: float = 0.9, clean: float = 0.5
+) -> bool:
     """Return whether a verdict is probable, and predicted what tested it.
 
     Args:
         report: Report with the verdict, and the trials that were run. Those since it
             was reached have to agree with its predictions, and there has to be one.
-        settling: Probabilities that a verdict has to have.
         enough: Number of these that has to be there where effects are named.
+        probability: Probability of a verdict that names effects from which it may be.
+        clean: Probability of "none" from which it may be: that before any trial. With
+            .9 one clean simulator of eight was tested two or three times for nothing.
     """
     verdict, is_clean = report.verdict, report.verdict == NONE
-    own = [*takewhile(lambda t: t.registered.verdict == verdict, report.measured[::-1])]
-    needed = settling.clean if is_clean else settling.probability
+    own = [*takewhile(lambda t: t.verdict == verdict, report.measured[::-1])]
     held = len(own) >= (1 if is_clean else enough) and all(trial.held for trial in own)
-    return held and probability_of(report) >= needed
+    return held and probability_of(report) >= (clean if is_clean else probability)
 
 
 def register(
     criticism: Criticism,
     report: Report,
-    choice: Choice,
+    action: Array,
     index: float,
     *,
     num_draws: int = 400,
-) -> Registered:
+) -> TestedTrial:
     """Return what the verdict predicts of a trial.
 
     Args:
         criticism: The models, fitted to the trials so far.
         report: Report with their verdict.
-        choice: The trial.
+        action: Action of the trial, shape (action_dim,).
         index: Place of the trial in the order of execution.
         num_draws: Draws of a registered prediction: its 90 % limit has a
             standard error of 1 %.
     """
     rivals = criticism.rivals
-    trial = following(rivals, torch.from_numpy(choice.action)[None])
+    trial = following(rivals, torch.from_numpy(action)[None])
     trial.index = torch.full_like(trial.index, index)
     seed = derive_seed(rivals.seed, "registered", len(rivals.trials))
     options: dict[str, Any] = {"num_draws": num_draws, "seed": seed, "scored": False}
@@ -218,10 +164,9 @@ def register(
     if spread is not None:
         mean = prediction.middle
         limit = limit_of(spread.square, len(mean)) / spread.scale
-    return Registered(
+    return TestedTrial(
         index=index,
-        action=choice.action,
-        purpose=choice.purpose,
+        action=action,
         verdict=report.verdict,
         mean=mean,
         sd=sd,

@@ -19,18 +19,16 @@ from sbi_active.criticism.data.arrays import without_inf
 from sbi_active.criticism.data.trials import Trials
 from sbi_active.criticism.effects.trial_conditions import unmeasured
 from sbi_active.criticism.experiments.choice import (
-    Settling,
     choose,
-    failures,
     is_settled,
     register,
     unless_unproven,
 )
-from sbi_active.criticism.report.contents import Registered, TestedTrial
+from sbi_active.criticism.report.contents import TestedTrial
 from sbi_active.criticism.report.report import Report
 from sbi_active.criticism.results import Array
 from sbi_active.expected import require
-from sbi_active.messages import Explained, Message
+from sbi_active.messages import Explained
 from sbi_active.simulation import SimulatorModel
 
 
@@ -57,9 +55,8 @@ def settle(
     max_trials: int,
     directory: str | Path | None = None,
     evaluate: bool = True,
-    plan: bool = True,
-    designed: bool = False,
-    settling: Settling = Settling(),  # noqa: B008  (frozen)
+    tests: int = 3,
+    **options: bool,
 ) -> Report:
     """Return the report after as many trials as settle its verdict.
 
@@ -76,9 +73,9 @@ def settle(
         directory: Folder that keeps predictions and measurements, from which a loop
             that was interrupted goes on; None keeps them in the report alone.
         evaluate: Whether the report has the error before and after.
-        plan: Whether the report has the action to take next.
-        designed: Whether the trials' actions were chosen for their information.
-        settling: When a verdict is settled.
+        tests: Trials that a verdict that names effects has to predict: of the aliases
+            of tuning seeds that fall by a trial some predict one, and one two.
+        **options: Further options of :meth:`.Criticism.report`.
 
     Raises:
         ValueError: If there are no permitted actions, or the folder belongs to other
@@ -92,34 +89,48 @@ def settle(
     journal.begin(digest=first.digest, num_trials=len(trials))
     tested = journal.tested()
     for trial in tested:
-        trials = with_trial(first.model, trials, trial.registered.action, trial.x)
+        trials = with_trial(first.model, trials, trial.action, trial.x)
     scored = evaluate and bool(trials.held_out_positions)
+
+    def verdict() -> tuple[Criticism, Report]:
+        try:
+            found = compare(trials) if tested else first
+            report = found.report(evaluate=scored, plan=False)
+        except Exception as error:
+            if not tested:
+                raise
+            raise VerdictError(
+                f"expected a verdict on {len(trials)} trials; got {error}; go on from "
+                "the directory, or from .trials of this error",
+                trials,
+            ) from error
+        return found, replace(report, tested=(*tested,))
+
     while True:
-        criticism, report = _verdict(compare, trials, first, tested, evaluate=scored)
-        is_last, choice = len(tested) >= max_trials, None
-        if not (is_last or is_settled(report, settling, settling.tests)):
-            choice = choose(criticism, report, settling)
-        if choice is None:  # fewer tests settle where no action is left
+        criticism, report = verdict()
+        is_last, chosen = len(tested) >= max_trials, None
+        if not (is_last or is_settled(report, tests)):
+            chosen = choose(criticism, report)
+        if chosen is None:  # fewer tests settle where no action is left
             why = "no trials are left" if is_last else "no permitted action tells more"
-            stopped = "settled" if is_settled(report, settling) else why
+            stopped = "settled" if is_settled(report) else why
             break
-        registered = register(criticism, report, choice, _next_index(trials))
-        journal.write("registered", **vars(registered))
-        action = torch.from_numpy(choice.action).float()
-        x = np.array(torch.as_tensor(real_system(action)), dtype=float)
+        registered = register(criticism, report, chosen, _next_index(trials))
+        predicted = {k: v for k, v in vars(registered).items() if k != "x"}
+        journal.write("registered", **predicted)
+        action = torch.from_numpy(registered.action)
+        x = np.array(torch.as_tensor(real_system(action.float())), dtype=float)
         journal.write("measured", index=registered.index, x=x)
-        tested.append(TestedTrial(registered=registered, x=x))
-        trials = with_trial(first.model, trials, choice.action, x)
-    options = {"evaluate": evaluate, "plan": plan}
-    report = criticism.report(designed=designed or bool(tested), **options)
+        tested.append(replace(registered, x=x))
+        trials = with_trial(first.model, trials, registered.action, x)
+    report = criticism.report(evaluate=evaluate, **options)
     report = replace(report, tested=(*tested,))
     report = unless_unproven(report, criticism.rule.remaining)
-    if stopped == "settled" and not is_settled(report, settling):
+    if stopped == "settled" and not is_settled(report):
         stopped = "trials that had no part in it speak against the verdict"
-    verdicts = [*[t.registered.verdict for t in tested], report.verdict]
-    after = (*[replace(t, after=v) for t, v in zip(tested, verdicts[1:], strict=True)],)
-    warnings = (*report.warnings, *map(Message, failures(report)))
-    return replace(report, tested=after, stopped=stopped, warnings=warnings)
+    verdicts = [*[trial.verdict for trial in tested[1:]], report.verdict]
+    after = (*[replace(t, after=v) for t, v in zip(tested, verdicts, strict=False)],)
+    return replace(report, tested=after, stopped=stopped)
 
 
 def with_trial(
@@ -148,28 +159,6 @@ def with_trial(
 
 def _next_index(trials: Trials) -> float:
     return float(trials.index.max()) + 1
-
-
-def _verdict(
-    compare: Callable[[Trials], Criticism],
-    trials: Trials,
-    first: Criticism,
-    tested: list[TestedTrial],
-    *,
-    evaluate: bool,
-) -> tuple[Criticism, Report]:
-    try:
-        criticism = compare(trials) if tested else first
-        report = criticism.report(evaluate=evaluate, plan=False)
-    except Exception as error:
-        if not tested:
-            raise
-        raise VerdictError(
-            f"expected a verdict on {len(trials)} trials; got {error}; go on from the "
-            "directory, or from .trials of this error",
-            trials,
-        ) from error
-    return criticism, replace(report, tested=(*tested,))
 
 
 NAME = "trials.jsonl"
@@ -221,25 +210,18 @@ class Journal:
 
     def tested(self) -> list[TestedTrial]:
         """Return the trials that were measured, each with its prediction."""
-        of: dict[float, dict[str, Any]] = {}
+        trials = dict[float, dict[str, Any]]()
         for event in self.events:
             if "index" in event:
-                of.setdefault(event["index"], {})[event["event"]] = event
-        return [
-            TestedTrial(
-                registered=_registered(parts["registered"]),
-                x=np.asarray(parts["measured"]["x"], dtype=float),
-            )
-            for parts in of.values()
-            if "measured" in parts
-        ]
+                trials.setdefault(event["index"], {}).update(event)
+        return [_tested(parts) for parts in trials.values() if "x" in parts]
 
 
-def _registered(event: dict[str, Any]) -> Registered:
-    own = {f.name: event[f.name] for f in fields(Registered) if f.name in event}
-    arrays = {k: np.asarray(v) for k, v in own.items() if isinstance(v, list)}
-    without = {k: np.asarray(v) for k, v in own.pop("without", {}).items()}
-    return Registered(**{**own, **arrays}, without=without)
+def _tested(parts: dict[str, Any]) -> TestedTrial:
+    own = {f.name: parts[f.name] for f in fields(TestedTrial) if f.name in parts}
+    own |= {k: np.asarray(v) for k, v in own.items() if isinstance(v, list)}
+    own["without"] = {k: np.asarray(v) for k, v in own.get("without", {}).items()}
+    return TestedTrial(**{**own, "x": np.asarray(own["x"], dtype=float)})
 
 
 def _read(path: Path) -> list[dict[str, Any]]:

@@ -68,7 +68,7 @@ def unless_refuted(tracing: Tracing, evaluation: Evaluation | None) -> Tracing:
                 return replace(made, refuted_on=where)
     if evaluation is None:
         return tracing
-    change = evaluation.after[DENSITY] - evaluation.before[DENSITY]
+    change = (evaluation.after - evaluation.before)[DENSITY].to_numpy()
     told = _told(evaluation)
     before, after = _rmse(evaluation, told)
     if after <= before or change[told].sum() >= -THRESHOLD:
@@ -107,7 +107,7 @@ def _told(evaluation: Evaluation) -> NDArray[np.bool_]:
     A few that no model predicts by far may have gross errors, and the chance by which
     one model is nearer would outweigh all others. Where most are, they are the model's.
     """
-    told = np.ones(len(evaluation.trials), bool)
+    told = np.ones(len(evaluation.names), bool)
     told[[trial.position for trial in evaluation.missed if trial.by_both]] = False
     return told if 2 * told.sum() >= len(told) else np.ones(len(told), bool)
 

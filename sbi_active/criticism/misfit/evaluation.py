@@ -51,9 +51,8 @@ def evaluate_held_out(
     before = after = predict(rivals, held_out, num_draws=num_draws)
     if tracing.verdict != NONE:
         after = predict(rivals, held_out, key=tracing.key, num_draws=num_draws)
-    num = len(held_out)
-    scored, selected = (scores(before), scores(after)), (tracing.verdict,) * num
-    found = summary("held out", np.arange(num), *scored, selected, held_out.names)
+    selected, names = (tracing.verdict,) * len(held_out), held_out.names
+    found = summary("held out", scores(before), scores(after), selected, names)
     sensor = None
     if rivals.model.noise is not None:
         square = rivals.measurements.by_channel(rivals.sensor.typical_sd**2)
@@ -110,12 +109,9 @@ def evaluate_left_out(
             selected.append(
                 str(ModelKey(key.effects) if named else ModelKey(error=key.error))
             )
-    first, last = (
-        {name: np.concatenate([p[name] for p in parts]) for name in parts[0]}
-        for parts in (before, after)
-    )
+    first, last = (pd.concat(each, ignore_index=True) for each in (before, after))
     names = tuple(trials.names[int(i)] for i in places)
-    return summary("leave one out", places, first, last, (*selected,), names)
+    return summary("leave one out", first, last, (*selected,), names)
 
 
 def _predicting(found: Verdict, key: ModelKey) -> ModelKey:
@@ -130,8 +126,8 @@ def _predicting(found: Verdict, key: ModelKey) -> ModelKey:
     return ModelKey(key.effects, SCATTER)
 
 
-def scores(prediction: Prediction) -> dict[str, Array]:
-    """Return one value a trial of each metric, and squares and counts for the RMSE.
+def scores(prediction: Prediction) -> pd.DataFrame:
+    """Return a row a trial: the metrics, and square and count for the RMSE of all.
 
     Coverage is that of the central interval of 90 %.
     """
@@ -149,15 +145,14 @@ def scores(prediction: Prediction) -> dict[str, Array]:
         rmse, energy = np.sqrt(square / at.sum()), distance - 0.5 * within
         density = prediction.log_density[t]
         rows.append((rmse, energy, density, inside, square, at.sum()))
-    columns = np.array(rows, dtype=float).T
-    return dict(zip((*METRICS, "square", "count"), columns, strict=True))
+    columns = pd.Index([*METRICS, "square", "count"])
+    return pd.DataFrame(rows, columns=columns, dtype=float)
 
 
 def summary(
     scheme: Any,
-    positions: Array,
-    before: dict[str, Array],
-    after: dict[str, Array],
+    before: pd.DataFrame,
+    after: pd.DataFrame,
     selected: tuple[str, ...],
     names: tuple[str, ...],
 ) -> Evaluation:
@@ -166,35 +161,33 @@ def summary(
     A bootstrap of 2,000 draws gives the ends of the interval to some percent, and below
     eight trials none that is what it claims to be.
     """
-    num = len(positions)
+    num, rows = len(before), []
     resampled = np.random.default_rng(0).integers(num, size=(2_000, num))
-    rows = []
     for metric in METRICS:
         first, second = (_total(s, metric, np.arange(num)) for s in (before, after))
-        low = high = np.nan
+        interval = None
         if num >= 8:
             each = (_total(s, metric, resampled) for s in (before, after))
-            low, high = np.quantile(_contrast(metric, *each), [0.05, 0.95])
+            ends = np.quantile(_contrast(metric, *each), [0.05, 0.95])
+            interval = tuple(ends.tolist())
         ratio = float(_contrast(metric, first, second))
-        rows.append((metric, float(first), float(second), ratio, low, high))
-    columns = ["metric", "before", "after", "ratio", "low", "high"]
+        rows.append((metric, float(first), float(second), ratio, interval))
+    columns = pd.Index(["metric", "before", "after", "ratio", "interval"])
     return Evaluation(
         scheme=scheme,
-        trials=positions,
-        before={name: before[name] for name in METRICS},
-        after={name: after[name] for name in METRICS},
-        table=pd.DataFrame(rows, columns=pd.Index(columns)),
+        before=before,
+        after=after,
+        table=pd.DataFrame(rows, columns=columns),
         selected=selected,
         names=names,
-        num_numbers=int(before["count"].sum()),
     )
 
 
-def _total(scores: dict[str, Array], metric: str, which: Array) -> Any:
+def _total(scores: pd.DataFrame, metric: str, which: Array) -> Any:
+    own = {name: values.to_numpy()[which] for name, values in scores.items()}
     if metric == "rmse":
-        square, count = (scores[name][which].sum(-1) for name in ("square", "count"))
-        return np.sqrt(square / count)
-    return scores[metric][which].mean(-1)
+        return np.sqrt(own["square"].sum(-1) / own["count"].sum(-1))
+    return own[metric].mean(-1)
 
 
 def _contrast(metric: str, before: Any, after: Any) -> Any:

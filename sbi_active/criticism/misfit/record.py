@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from itertools import combinations
 from typing import Any
 
 import numpy as np
 
 from sbi_active.arrays import Array
-from sbi_active.criticism.contradictions import Misfit as Found
-from sbi_active.criticism.contradictions import ModelError
+from sbi_active.criticism.contradictions import Misfit, ModelError
 from sbi_active.criticism.data.trials import Trials
-from sbi_active.criticism.linear.model import LinearModel
 from sbi_active.criticism.misfit.contrary import is_left_to_chance, withdrawn
 from sbi_active.criticism.misfit.draws import posterior, shown
 from sbi_active.criticism.misfit.guesses import guess_residual
@@ -21,8 +18,6 @@ from sbi_active.criticism.misfit.scored import weights_by_error
 from sbi_active.criticism.misfit.verdict import Verdict
 from sbi_active.criticism.results import (
     UNEXPLAINED,
-    Estimate,
-    Evidence,
     ModelKey,
     Tracing,
 )
@@ -47,12 +42,16 @@ def traced(
     """
     rivals, is_missed = found.rivals, found.is_missed
     probabilities = _tabled(found) if is_missed else found.probabilities
-    models = _with_posteriors(found)
+    fits = {
+        key: shown(found, posterior(found, rivals, key))
+        for key in dict.fromkeys(_recorded(found))
+    }
+    models = rivals.with_fits(fits)
     evidences = {str(key): fit.evidence for key, fit in models.fits.items()}
     by_name = {str(key): p for key, p in probabilities.items()}
     helps, named = found.helps, found.named
     error = found.key.error or (UNEXPLAINED if is_missed else None)
-    trials, chosen = rivals.trials, helps if is_missed else named
+    chosen = helps if is_missed else named
     tracing = Tracing(
         verdict=str(ModelKey(named) if named else ModelKey(error=error)),
         chosen=chosen,
@@ -60,18 +59,15 @@ def traced(
         inclusion=found.inclusion,
         credible_set=credible_set(by_name),
         equivalent=(*found.equivalent,),
-        estimates=_estimates(found, evidences),
+        effects=rivals.effects,
         evidences=evidences,
         guesses=_guesses(found),
         beside=tuple(n for n in helps if n not in named),
-        trial_names=dict(zip(trials.index.tolist(), trials.names, strict=True)),
         p_value=found.p_value,
         outliers=found.outliers,
+        aliases=like_the_verdict(found, chosen) if found.detection.alarm else (),
         **(_missing(found, models, held_out) if is_missed else _explaining(found)),
     )
-    if found.detection.alarm:
-        aliases = like_the_verdict(found, chosen, found.equivalent)
-        tracing = replace(tracing, aliases=aliases)
     is_withdrawn = not is_missed and is_left_to_chance(tracing)
     return withdrawn(tracing) if is_withdrawn else tracing, models
 
@@ -81,10 +77,7 @@ def _explaining(found: Verdict) -> dict[str, Any]:
     states, best = found.states, found.choice.key
     gain = states.log_evidence(ModelKey(best.effects, UNEXPLAINED))
     needed = states.needed(ModelKey(found.named), THRESHOLD) if found.named else ()
-    return {
-        "needed": needed,
-        "log_process": gain - states.log_evidence(best),
-    }
+    return {"needed": needed, "log_process": gain - states.log_evidence(best)}
 
 
 def _tabled(found: Verdict) -> dict[ModelKey, float]:
@@ -97,10 +90,28 @@ def _tabled(found: Verdict) -> dict[ModelKey, float]:
 def _missing(
     found: Verdict, models: RivalSet, held_out: Trials | None
 ) -> dict[str, Any]:
-    """Return the part of a tracing that is of models that all miss the trials."""
-    tabled = dict.fromkeys([*_shown(found), found.choice.key, ModelKey()])
-    errors = [_scored(found, models, key, held_out) for key in tabled]
-    return {"misfit": _found(found, errors)}
+    """Return the part of a tracing that is of models that all miss the trials.
+
+    Laws of friction, for example, imitate each other: while something undeclared is
+    left, another form of a declared family, declared or not, may be what is there.
+    """
+    choice, search, m = found.choice, found.search, found.rivals.measurements
+    named = [found.rivals.effects[name] for name in choice.named]
+    open_forms = {e.name: str(e.family) for e in named if e.family != e.hook}
+    tabled = dict.fromkeys([*_shown(found), choice.key, ModelKey()])
+    misfit = Misfit(
+        models=tuple(_scored(found, models, key, held_out) for key in tabled),
+        helps=choice.key.effects,
+        named=choice.named,
+        support=choice.support,
+        open_forms={} if found.passes else open_forms,
+        sensor=np.sqrt(m.by_channel(search.unit**2)),
+        passes=found.passes,
+        left_out="trials" if search.errors.is_by_trial else "parts of trials",
+        weights={str(key): weight for key, weight in _weights(found).items()},
+        instead=choice.instead,
+    )
+    return {"misfit": misfit}
 
 
 def _recorded(found: Verdict) -> list[ModelKey]:
@@ -120,13 +131,6 @@ def _recorded(found: Verdict) -> list[ModelKey]:
     louder = [key for key in p if states.louder(key) and p[key] >= SHOWN]
     keys = [*states.keys(ModelKey()), *_shown(found), found.key, *louder, *singles]
     return [key for key in keys if key.error is None or not key.effects]
-
-
-def _with_posteriors(found: Verdict) -> RivalSet:
-    """Return the models with the posteriors of some of them, as they are shown."""
-    models, keys = found.rivals, dict.fromkeys(_recorded(found))
-    fits = {key: shown(found, posterior(found, models, key)) for key in keys}
-    return models.with_fits(fits)
 
 
 def _shown(found: Verdict) -> list[ModelKey]:
@@ -158,39 +162,6 @@ def _weights(misfit: Verdict) -> dict[ModelKey, float]:
     return dict([(k, w) for k, w in weights.items() if w >= 0.05][:6])
 
 
-def _found(misfit: Verdict, models: Sequence[ModelError]) -> Found:
-    choice, search = misfit.choice, misfit.search
-    m = search.rivals.measurements
-    size, time_scale = search.errors.process(search.found[choice.key].beside)
-    return Found(
-        models=(*models,),
-        helps=choice.key.effects,
-        named=choice.named,
-        support=choice.support,
-        open_forms=_open_forms(misfit),
-        sensor=np.sqrt(m.by_channel(search.unit**2)),
-        passes=misfit.passes,
-        size=size,
-        time_scale=time_scale if misfit.timed else np.nan,
-        left_out="trials" if search.errors.is_by_trial else "parts of trials",
-        weights={str(key): weight for key, weight in _weights(misfit).items()},
-        instead=choice.instead,
-    )
-
-
-def _open_forms(misfit: Verdict) -> dict[str, str]:
-    """Return the declared families of the effects that are named, if more is missing.
-
-    Laws of friction, for example, imitate each other: while something undeclared is
-    left, another form of the family, declared or not, may be what is there.
-    """
-    if misfit.passes:
-        return {}
-    effects = misfit.rivals.effects
-    named = [effects[name] for name in misfit.choice.named]
-    return {e.name: str(e.family) for e in named if e.family != e.hook}
-
-
 def _scored(
     misfit: Verdict, models: RivalSet, key: ModelKey, held_out: Trials | None
 ) -> ModelError:
@@ -218,35 +189,8 @@ def _held_out(models: RivalSet, key: ModelKey, held_out: Trials) -> Array:
     return np.sqrt(m.by_channel((m.x - prediction.middle) ** 2))
 
 
-def _estimates(found: Verdict, evidences: dict[str, Evidence]) -> tuple[Estimate, ...]:
-    """Return each effect by the model that has it alone, likeliest first.
-
-    Its phi is the end of the draws, and of the best fit of a model that misses.
-    """
-    bare, estimates = evidences[str(ModelKey())].log_evidence, []
-    for name, effect in found.rivals.effects.items():
-        if name not in evidences:
-            continue
-        own = evidences[name]
-        phi = own.draws[:, -effect.phi_dim :]
-        center = phi.mean(0) if own.best is None else own.best[-effect.phi_dim :]
-        estimate = Estimate(
-            name=name,
-            family=str(effect.family),
-            units=effect.units,
-            describe=effect.describe or "",
-            probability=found.inclusion[name],
-            log_bayes_factor=own.log_evidence - bare,
-            mean=center,
-            sd=phi.std(0),
-            engine=own.engine,
-        )
-        estimates.append(estimate)
-    return (*sorted(estimates, key=lambda e: -e.probability),)
-
-
 def like_the_verdict(
-    found: Verdict, chosen: Sequence[str], equivalent: Sequence[frozenset[str]]
+    found: Verdict, chosen: Sequence[str]
 ) -> tuple[frozenset[str], ...]:
     r"""Return pairs of an effect of the verdict and one that is nearly the same here.
 
@@ -257,23 +201,21 @@ def like_the_verdict(
     .. math::
         \tfrac1N \sum_i (m_{a,i} - m_{b,i})^2 / s_i^2 < 1 .
 
-    They need not be equivalent: another action, repeated trials, or stronger data may
-    tell them apart.
+    They need not be equivalent, which is stated already: another action, repeated
+    trials, or stronger data may tell them apart.
 
     Args:
         found: The verdict, whose search has fitted each effect alone.
         chosen: Effects that it adds.
-        equivalent: Groups that are stated already.
     """
-    search, models, log_z = found.search, dict[str, LinearModel](), dict[str, float]()
-    for name in search.names:
-        key = ModelKey((name,))
-        models[name] = search.model(key)
-        log_z[name] = (
-            search.found[key].beside.log_evidence
-            if found.is_missed
-            else found.states.log_evidence(key)
-        )
+    search, keys = found.search, {n: ModelKey((n,)) for n in found.search.names}
+    models = {name: search.model(key) for name, key in keys.items()}
+    log_z = {
+        name: search.found[key].beside.log_evidence
+        if found.is_missed
+        else found.states.log_evidence(key)
+        for name, key in keys.items()
+    }
     best = max(log_z.values(), default=-np.inf)
     likely = [name for name, value in log_z.items() if value > best - THRESHOLD]
 
@@ -285,6 +227,6 @@ def like_the_verdict(
         frozenset(pair)
         for pair in combinations(likely, 2)
         if {*pair} & {*chosen}
-        and not any({*pair} <= group for group in equivalent)
+        and not any({*pair} <= group for group in found.equivalent)
         and is_close(*pair)
     )

@@ -89,7 +89,6 @@ class Verdict:
             degrees_of_freedom=float(freedom),
             p_value=p,
             level=LEVEL if rivals.has_known_noise else 0.0,
-            null_log_evidence=states.log_evidence(ModelKey()),
         )
         noise, spare = rivals.model.noise, len(bare.model.residual) - len(bare.model.u)
         is_declared = noise is not None and noise.posterior is None and spare > 0
@@ -356,12 +355,7 @@ class Verdict:
         rows, names = np.unique(errors.measurements.trial), self.rivals.trials.names
         square = np.nan_to_num(self.standard(found), nan=1.0)
         return tuple(
-            OutlyingTrial(
-                position=int(rows[k]),
-                name=names[rows[k]],
-                times=times,
-                size=float(np.sqrt(found.left.square[k])),
-            )
+            OutlyingTrial(position=int(rows[k]), name=names[rows[k]], times=times)
             for k, times in outlying_trials(square.tolist())
         )
 

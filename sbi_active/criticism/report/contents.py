@@ -1,8 +1,8 @@
-"""Contents of a report, apart from its layout."""
+"""Facts of a report, which all that it says is made from."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -14,6 +14,7 @@ from torch.distributions import Distribution
 
 from sbi_active.criticism.contradictions import SevereTest
 from sbi_active.criticism.data.columns import split
+from sbi_active.criticism.data.trials import Trials
 from sbi_active.criticism.results import (
     NONE,
     UNEXPLAINED,
@@ -32,15 +33,17 @@ from sbi_active.identifiability.known import (
 from sbi_active.seeding import forked_generators
 from sbi_active.simulation.model import SimulatorModel
 
+#: Probability with which an outcome lies within the interval of its prediction.
+COVERAGE = 0.9
+
 
 @dataclass(frozen=True, kw_only=True)
-class Registered:
-    """What a verdict predicts of a trial, written down before the trial is run.
+class TestedTrial:
+    """A trial that was run to test a verdict, and was predicted before.
 
     Attributes:
         index: Place of the trial in the order of execution.
         action: Action of the trial, shape (action_dim,).
-        purpose: What the trial is to tell.
         verdict: Verdict that predicts.
         mean: Predicted numbers, shape (N,), in units of x.
         sd: Their standard deviations, noise included, shape (N,).
@@ -49,31 +52,19 @@ class Registered:
             square over x in ``sd``.
         without: Numbers that the same model predicts without each of its effects, by
             name, named by the verdict or not.
+        x: Measured numbers, of the shape of x; none before it was run.
+        after: Verdict with the trial among the data.
     """
 
     index: float
     action: Array
-    purpose: str
     verdict: str
     mean: Array
     sd: Array
     position: Array
     limit: float
     without: dict[str, Array] = field(default_factory=dict)
-
-
-@dataclass(frozen=True, kw_only=True)
-class TestedTrial:
-    """A trial that was run to test a verdict.
-
-    Attributes:
-        registered: Prediction, made before the trial was run.
-        x: Measured numbers, of the shape of x.
-        after: Verdict with the trial among the data.
-    """
-
-    registered: Registered
-    x: Array
+    x: Array = field(default_factory=lambda: np.empty(0))
     after: str = ""
 
     __test__ = False  # no test of pytest's
@@ -81,7 +72,7 @@ class TestedTrial:
     @property
     def distance(self) -> float:
         """Distance of the outcome from the prediction, in its standard deviations."""
-        return self.off(self.registered.mean, self.registered.sd)
+        return self.off(self.mean, self.sd)
 
     @property
     def is_measured(self) -> bool:
@@ -91,23 +82,19 @@ class TestedTrial:
     @property
     def held(self) -> bool:
         """Whether the outcome lies within the 90 % interval of the prediction."""
-        return self.distance <= self.registered.limit
+        return self.distance <= self.limit
 
     def in_words(self) -> tuple[str, str]:
         """Return what was predicted and what was measured, in units of x."""
-        own, is_one = self.registered, len(self.registered.mean) == 1
-        half = own.limit * float(np.sqrt(np.mean(own.sd**2)))
+        half = self.limit * float(np.sqrt(np.mean(self.sd**2)))
         predicted = f"within {half:.3g} of its course"
-        if is_one:
-            predicted = f"{own.mean[0] - half:.4g} to {own.mean[0] + half:.4g}"
-        if not self.is_measured:
-            return predicted, "nothing"
-        measured = f"{self.off(own.mean):.3g} off"
-        if is_one:
-            measured = f"{np.ravel(self.x)[own.position][0]:.4g}"
-        for name, mean in own.without.items():
+        measured = f"{self.off(self.mean):.3g} off"
+        if len(self.mean) == 1:
+            predicted = f"{self.mean[0] - half:.4g} to {self.mean[0] + half:.4g}"
+            measured = f"{np.ravel(self.x)[self.position][0]:.4g}"
+        for name, mean in self.without.items():
             measured += f" (without {name}: {self.off(mean):.3g} off)"
-        return predicted, measured
+        return predicted, measured if self.is_measured else "nothing"
 
     def off(self, predicted: Array, unit: Array | float = 1.0) -> float:
         """Return the root mean square by which a prediction missed; NaN for none.
@@ -116,7 +103,7 @@ class TestedTrial:
             predicted: Numbers that were predicted, shape (N,).
             unit: Unit of each, in that of x.
         """
-        error = (np.ravel(self.x)[self.registered.position] - predicted) / unit
+        error = (np.ravel(self.x)[self.position] - predicted) / unit
         error = error[np.isfinite(error)]
         return float(np.sqrt(np.mean(error**2))) if len(error) else float("nan")
 
@@ -126,6 +113,7 @@ class Contents:
     """Findings of the closed loop.
 
     Attributes:
+        trials: The measured trials, those left out that were set aside.
         residuals: Residuals of the bare model.
         residuals_after: Residuals of the augmented one; None if nothing was added.
         detection: Whether the bare model misses the data.
@@ -135,37 +123,32 @@ class Contents:
             gained. None without permitted actions.
         simulator: The augmented simulator, or the bare one where nothing was added.
         prior: Prior of its parameters (never a posterior).
-        warnings: Warnings, one sentence each.
-        num_simulations: Trials simulated for all of it.
         digest: Hash of noise, library and priors as they were before the data.
-        exploratory: Library or priors were changed after the data were seen.
-        num_trials: Trials that could be fitted.
         action_labels: Labels of the entries of the action, with their units.
-        channel_names: Names of the entries of x's last axis, where known.
         severe_tests: Actions that would put a verdict that names effects to the test
             most: a permitted action, and one beyond.
-        action_is_label: Whether the action is only the trial's number.
+        designed: Actions were chosen for their information.
+        exploratory: Library or priors were changed after the data were seen.
+        notes: What the comparison left out, a code and a sentence each.
         tested: Trials that were run to test the verdict, in order.
         stopped: Reason to run no more of them.
     """
 
+    trials: Trials
     residuals: Residuals
     detection: Detection
     tracing: Tracing
     simulator: SimulatorModel
     prior: Distribution
-    warnings: tuple[str, ...]
-    exploratory: bool
-    num_trials: int
-    action_labels: tuple[str, ...]
-    channel_names: tuple[str, ...] | None
+    action_labels: Sequence[str]
     residuals_after: Residuals | None = None
     evaluation: Evaluation | None = None
     next_action: NextAction | None = None
-    digest: str = ""
-    num_simulations: int = 0
     severe_tests: tuple[SevereTest, ...] = ()
-    action_is_label: bool = False
+    digest: str = ""
+    designed: bool = False
+    exploratory: bool = False
+    notes: tuple[str, ...] = ()
     tested: tuple[TestedTrial, ...] = ()
     stopped: str = ""
 
@@ -212,8 +195,8 @@ class Contents:
         Args:
             name: Name of the effect.
         """
-        own = [t for t in self.measured if name in t.registered.without]
-        without = [t.off(t.registered.without[name], t.registered.sd) for t in own]
+        own = [trial for trial in self.measured if name in trial.without]
+        without = [trial.off(trial.without[name], trial.sd) for trial in own]
         if not any(without):
             return np.inf if own else np.nan
         return sum(t.distance**2 for t in own) / sum(d**2 for d in without)
@@ -231,22 +214,15 @@ class Contents:
 
         The ratio of "log predictive density" and "coverage" is their difference.
         """
-        columns = pd.Index(["metric", "before", "after", "ratio", "interval"])
-        if self.evaluation is None:
-            return pd.DataFrame(columns=columns)
-        table = self.evaluation.table
-        ends = zip(table["low"], table["high"], strict=True)
-        interval = [
-            (float(a), float(b)) if np.isfinite(a + b) else None for a, b in ends
-        ]
-        table = table.assign(interval=pd.Series(interval, dtype=object))
-        return table.reindex(columns=columns)
+        columns = ["metric", "before", "after", "ratio", "interval"]
+        scored = self.evaluation
+        return pd.DataFrame(columns=columns) if scored is None else scored.table
 
     @property
-    def rmse(self) -> tuple[float, float]:
-        """Root mean square error before and after, where trials were scored."""
-        assert self.evaluation is not None
-        return self.evaluation.rmse
+    def evidence(self) -> Evidence:
+        """The model of the verdict, or the bare one where it has no draws."""
+        evidences = self.tracing.evidences
+        return evidences.get(self.tracing.model, evidences[NONE])
 
     @property
     def parameters(self) -> pd.DataFrame:
@@ -255,13 +231,10 @@ class Contents:
         Values are means and deviations of posteriors. A model that misses the trials
         has its best fit, with a deviation that includes the misfit.
         """
-        bare = self.tracing.evidences[NONE]
-        after = self.tracing.evidences.get(self.tracing.model, bare)
-        parts = [_moments(bare, "before")]
-        parts += [] if after is bare else [_moments(after, "after")]
-        table = pd.concat(parts, axis=1).rename_axis("parameter")
-        columns = ["before", "before_sd", "after", "after_sd"]
-        return table.reindex(columns=pd.Index(columns)).reset_index()
+        before, after = self.tracing.evidences[NONE].moments, self.evidence.moments
+        rows = [(n, *before.get(n, (np.nan,) * 2), *after[n]) for n in after]
+        columns = ["parameter", "before", "before_sd", "after", "after_sd"]
+        return pd.DataFrame(rows, columns=columns)
 
     @property
     def residuals_by_trial(self) -> pd.DataFrame:
@@ -277,20 +250,23 @@ class Contents:
         z = by_channel(found.refitted, found)
         if self.tracing.misfit is not None:  # a prediction is as wide as the misfit
             z = left / self.tracing.misfit.sensor
-        times = found.times
-        if times is not None:
-            times = np.broadcast_to(times, left.shape[:2])
+        times = np.nan if found.times is None else found.times
+        times, channels = np.broadcast_to(times, z.shape[:2]), self.channels(z.shape[2])
         rows = []
         for t in np.flatnonzero(np.isfinite(z).any((1, 2))):
             k, c = np.unravel_index(np.nanargmax(np.abs(z[t])), z[t].shape)
-            when = np.nan if times is None else float(times[t, k])
-            size = float(root_mean_square(left[t, :, c]))
-            deviations = float(root_mean_square(z[t]))
-            name = found.called(int(t))
-            rows.append((name, float(found.index[t]), deviations, size, int(c), when))
-        columns = ["trial", "index", "deviations", "size", "channel", "time"]
-        table = pd.DataFrame(rows, columns=pd.Index(columns))
+            row = {"trial": found.names[t], "index": float(found.index[t])}
+            row["deviations"] = float(root_mean_square(z[t]))
+            row["size"] = float(root_mean_square(left[t, :, c]))
+            rows.append(row | {"channel": channels[int(c)], "time": float(times[t, k])})
+        table = pd.DataFrame(rows)
         return table.sort_values("deviations", ascending=False, kind="stable")
+
+    @property
+    def worst(self) -> list[Any]:
+        """Rows of that table as dictionaries, without columns that are not known."""
+        known = self.residuals_by_trial.dropna(axis="columns", how="all")
+        return known.to_dict("records")
 
     @property
     def growth(self) -> float | None:
@@ -311,6 +287,22 @@ class Contents:
         return float(last / first) if grows else None
 
     @property
+    def left(self) -> tuple[Array, Array | None, float]:
+        """Root mean square of what the verdict's model leaves.
+
+        In units of x and in deviations of the sensor, by channel, the latter None where
+        they are not declared; in those of the prediction.
+        """
+        found = self.residuals_after or self.residuals
+        left, in_predictions = found.x - found.mean, root_mean_square(found.refitted)
+        left = by_channel(left, found)
+        own, sensor = root_mean_square(left, (0, 1)), self.sensor
+        if sensor is None or sensor.shape not in ((1,), own.shape):
+            return own, None, float(in_predictions)
+        own = own if len(sensor) > 1 else root_mean_square(left)[None]
+        return own, own / sensor, float(in_predictions)
+
+    @property
     def sensor(self) -> Array | None:
         """The sensor's declared error by channel, shape (c,); None without."""
         if self.tracing.misfit is not None:
@@ -321,9 +313,7 @@ class Contents:
     @property
     def combinations(self) -> Combinations:
         """Combinations of parameters that the verdict's model knows, and does not."""
-        evidences = self.tracing.evidences
-        evidence = evidences.get(self.tracing.model, evidences[NONE])
-        prior = self.prior_draws("report")
+        prior, evidence = self.prior_draws("report"), self.evidence
         dim = prior.shape[1]
         draws = evidence.draws[:, :dim]  # beyond these there may be those of errors
         if draws.shape[1] < dim:
@@ -335,30 +325,32 @@ class Contents:
         with forked_generators(0, stream):
             return self.prior.sample(torch.Size([2_000])).double().numpy()
 
-    @property
-    def tests(self) -> list[str]:
-        """Actions of the severe tests, in words."""
-        return [
-            f"{'at' if test.is_permitted else 'beyond the permitted range at'} "
-            f"{self.setting(test.action)}"
-            for test in self.severe_tests
-        ]
+    def called(self, indices: Iterable[float]) -> list[str]:
+        """Return the names of fitted trials by their indices."""
+        fit = self.trials.fit
+        names = dict(zip(fit.index.tolist(), fit.names, strict=True))
+        return [names[index] for index in indices]
 
-    def channels(self, num: int) -> list[tuple[str, str]]:
-        """Return name and unit of each of some channels."""
-        labels: Sequence[str] = self.channel_names or ()
-        if len(labels) != num:
-            labels = [f"channel {c}" for c in range(num)]
-        return [*map(split, labels)]
+    @property
+    def channel_names(self) -> Sequence[str] | None:
+        """Labels of the entries of x's last axis, where known."""
+        return self.trials.channel_labels or self.simulator.channel_names
+
+    def channels(self, num: int) -> Sequence[str]:
+        """Return the labels of a number of channels."""
+        names = self.channel_names or ()
+        return names if len(names) == num else [f"channel {c}" for c in range(num)]
 
     def setting(self, action: Array) -> str:
-        """Return an action in words: a label is the name of its trial."""
-        if not self.action_is_label:
-            return setting(self.action_labels, action)
-        own = np.flatnonzero((self.residuals.action == action).all(1))
-        names = self.residuals.names
-        name = names[own[0]] if len(own) and names else f"{action[0]:g}"
-        return f"the inputs of trial {name}"
+        """Return an action in words, as in "speed = 2.5 m/s", or its trial's name."""
+        if self.trials.action_is_label:
+            numbers = self.trials.action[:, 0].tolist()
+            names = dict(zip(numbers, self.trials.names, strict=True))
+            name = names.get(float(action[0]), f"{action[0]:g}")
+            return f"the inputs of trial {name}"
+        pairs = zip(map(split, self.action_labels), action, strict=True)
+        said = [f"{name} = {value:.4g} {unit}" for (name, unit), value in pairs]
+        return ", ".join(map(str.rstrip, said))
 
 
 def by_channel(x: Array, residuals: Residuals) -> Array:
@@ -371,28 +363,3 @@ def root_mean_square(x: Array, axis: int | tuple[int, ...] | None = None) -> Arr
     seen = np.isfinite(x)
     total = np.where(seen, x, 0.0) ** 2
     return np.sqrt(total.sum(axis) / np.maximum(seen.sum(axis), 1))
-
-
-def _moments(evidence: Evidence, when: str) -> pd.DataFrame:
-    """Return mean and deviation of each parameter in a model.
-
-    Draws of one that misses the trials are within the prior: their mean is no fit.
-    """
-    num = len(evidence.names)
-    draws, best = evidence.draws[:, :num], evidence.best
-    center = draws.mean(0) if best is None else best[:num]
-    values = {when: center, f"{when}_sd": draws.std(0)}
-    return pd.DataFrame(values, index=[*evidence.names])
-
-
-def setting(labels: Sequence[str], action: Array) -> str:
-    """Return an action in words, each entry with its name and unit.
-
-    Example:
-        >>> setting(["speed [m/s]", "tilt"], np.array([2.5, 0.125]))
-        'speed = 2.5 m/s, tilt = 0.125'
-    """
-    return ", ".join(
-        f"{name} = {value:.4g} {unit}".rstrip()
-        for (name, unit), value in zip(map(split, labels), action, strict=True)
-    )

@@ -8,34 +8,20 @@ holds, the simulator predicts trials that it was not fitted to within their erro
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass, field
-from typing import Any, Literal
+from functools import partial
+from typing import Any
 
 import numpy as np
 from scipy.stats import binom
 
 from sbi_active.criticism.report.contents import Contents
-from sbi_active.criticism.report.words import (
-    disagreeing,
-    listed,
-    not_told_from,
-    number,
-    stated,
-    suspects_in_words,
-)
-from sbi_active.criticism.results import NONE, OUTLIER, ModelKey
+from sbi_active.criticism.report.words import blocks
+from sbi_active.criticism.results import NONE, OUTLIER
 from sbi_active.criticism.rivals.rival import surprising_outcomes
 from sbi_active.criticism.steps.detection import TOO_SMALL
 
-Decision = Literal[
-    "SHIP",
-    "NO_IMPROVEMENT",
-    "NOT_IDENTIFIABLE",
-    "OUT_OF_PRIOR",
-    "WRONG_MODEL",
-    "NOT_ENOUGH_DATA",
-]
 #: Exit status of a process by decision; 1 and 2 are those of failures and misuse.
-EXIT_CODES: dict[Decision, int] = {
+EXIT_CODES = {
     "SHIP": 0,
     "NO_IMPROVEMENT": 10,
     "NOT_IDENTIFIABLE": 11,
@@ -43,7 +29,6 @@ EXIT_CODES: dict[Decision, int] = {
     "WRONG_MODEL": 13,
     "NOT_ENOUGH_DATA": 14,
 }
-MORE = "measure more"
 
 
 @dataclass(frozen=True)
@@ -56,7 +41,7 @@ class Gate:
         details: Effects to add, trials that are missed, bounds to move, combinations.
     """
 
-    decision: Decision
+    decision: str
     reason: str
     details: dict[str, Any] = field(default_factory=dict)
 
@@ -97,18 +82,15 @@ def gate_of(
         hides: Share of the declared variance in the residuals below which the noise is
             declared so large that more may hide in it than is left: half of it.
     """
-    scored = report.evaluation
-    num = 0 if scored is None else len(scored.trials)
-    if scored is None or num < fewest:
-        if report.verdict == OUTLIER:
-            return _contradicts(report)
-        reason = f"{num} trials were scored that had no part in the fit, and {fewest} "
-        reason += f"are needed, held out or each predicted by three others; {MORE}"
-        return Gate("NOT_ENOUGH_DATA", reason, {"scored": num})
-    if (narrow := _beyond_prior(report, level)) is not None:
+    scored, decide = report.evaluation, partial(_decided, report)
+    num = 0 if scored is None else len(scored.names)
+    if num >= fewest and (narrow := _beyond_prior(report, level)) is not None:
         return narrow
     if report.verdict == OUTLIER:
-        return _contradicts(report)
+        trials = report.called(report.tracing.outliers)[:1]
+        return decide("NOT_ENOUGH_DATA", "contradicts", {"trials": trials})
+    if scored is None or num < fewest:
+        return decide("NOT_ENOUGH_DATA", "scored", {"scored": num}, fewest=fewest)
     if report.verdict != NONE:
         return _wrong(report)
     missed = [trial.name for trial in scored.missed]
@@ -116,55 +98,52 @@ def gate_of(
     # The chi-square that raised no alarm is that of left-out trials too.
     tested = found.level > 0 if folds else np.isfinite(scored.p_value)
     outside = 1 - float(np.mean(scored.after["coverage"]))
-    chance = binom.sf(round(outside * scored.num_numbers) - 1, scored.num_numbers, 0.1)
+    numbers = int(scored.before["count"].to_numpy().sum())
+    chance = binom.sf(round(outside * numbers) - 1, numbers, 0.1)
     uncovered = not tested and outside > 1 - covered and chance < level
     if missed or scored.p_value < level or uncovered:
-        which = f"trials {listed(missed)}" if missed else f"the {num} scored trials"
-        reason = f"{which} are far outside what the simulator predicts"
-        return Gate("WRONG_MODEL", reason, {"trials": missed, "worst": _worst(report)})
-    rare = surprising_outcomes(report.residuals, level / report.num_trials)
-    if odd := [report.residuals.called(k) for kind in rare for k in kind]:
-        reason = " and ".join(disagreeing(*rare, report.residuals))
+        details = {"trials": missed, "worst": report.worst[0]}
+        return decide("WRONG_MODEL", "missed", details, num=num)
+    rare = surprising_outcomes(report.residuals, level / len(report.residuals.index))
+    if odd := [report.residuals.names[k] for kind in rare for k in kind]:
         decision = "WRONG_MODEL" if len(odd) > 1 else "NOT_ENOUGH_DATA"
-        return Gate(decision, reason, {"trials": odd})
-    if report.residuals.alike <= TOO_SMALL:
-        reason = "trials share their errors at the same times, as copies do, or what "
-        reason += f"the simulator lacks in each; check their records, or {MORE}"
-        return Gate("NOT_ENOUGH_DATA", reason, {"alike": report.residuals.alike})
+        return decide(decision, "outcomes", {"trials": odd}, rare=rare)
+    if (alike := report.residuals.alike) <= TOO_SMALL:
+        return decide("NOT_ENOUGH_DATA", "alike", {"alike": alike})
     left = found.chi_square / found.degrees_of_freedom
     if found.lower_p_value <= TOO_SMALL and left < hides:
-        reason = f"residuals are {left**0.5:.2g} times the declared noise, which may "
-        reason += "hide what the simulator lacks; declare the error of the measurement"
-        return Gate("NOT_ENOUGH_DATA", reason, {"residuals": left**0.5})
+        return decide("NOT_ENOUGH_DATA", "noise", {"residuals": left**0.5})
     if known := report.combinations:
-        return Gate("NOT_IDENTIFIABLE", str(known), {"combinations": known.to_dict()})
+        details = {"combinations": known.to_dict()}
+        return decide("NOT_IDENTIFIABLE", "combinations", details, known=known)
     if wide := _hardly_known(report):
-        reason = f"the trials hardly tell {listed(wide)}; {MORE}"
-        return Gate("NOT_ENOUGH_DATA", reason, {"parameters": wide})
+        return decide("NOT_ENOUGH_DATA", "parameters", {"parameters": wide})
     p = report.probabilities.get(NONE, 1.0)
     if p < likely:
         other = max(report.probabilities, key=report.probabilities.__getitem__)
-        reason = f"no alarm, though {other} is likelier ({stated(p)} for none); {MORE}"
-        return Gate("NOT_ENOUGH_DATA", reason, {"effects": [other]})
-    before, after = report.rmse
-    reason = f"the simulator predicts {num} trials that had no part in its fit, with a "
-    reason += f"root mean square error of {number(before)}"
-    return Gate("SHIP", reason, {"scored": num, "before": before, "after": after})
+        return decide("NOT_ENOUGH_DATA", "likelier", {"effects": [other]}, p=p)
+    before, after = scored.rmse
+    return decide("SHIP", "ships", {"scored": num, "before": before, "after": after})
 
 
-def _contradicts(report: Contents) -> Gate:
-    """Return the decision where one trial does not agree with the others."""
-    tracing = report.tracing
-    names = [tracing.trial_names.get(i, i) for i in tracing.outliers][:1]
-    reason = f"{suspects_in_words(tracing)} does not agree with the others; check and "
-    reason += "repeat it"
-    return Gate("NOT_ENOUGH_DATA", reason, {"trials": names})
+def _decided(
+    report: Contents,
+    decision: str,
+    case: str,
+    details: dict[str, Any],
+    **more: Any,
+) -> Gate:
+    """Return a decision, its reason in the words of ``gate.jinja``.
 
-
-def _worst(report: Contents) -> dict[str, Any]:
-    """Return the trial with the largest residuals."""
-    table = report.residuals_by_trial.head(1).dropna(axis="columns")
-    return next(iter(table.to_dict("records")), {})
+    Args:
+        report: Report that is decided on.
+        decision: The decision.
+        case: Case of the template.
+        details: Details of the decision.
+        **more: Further values that the reason tells.
+    """
+    given = {"report": report, "case": case, "details": details, **more}
+    return Gate(decision, blocks("gate", **given)[0], details)
 
 
 def _beyond_prior(report: Contents, level: float, *, kept: float = 0.1) -> Gate | None:
@@ -180,39 +159,26 @@ def _beyond_prior(report: Contents, level: float, *, kept: float = 0.1) -> Gate 
     found = [p for p in bounds.parameters if p.model == NONE]
     if not (found and explains and report.detection.alarm):
         return None
-    box, said, ends = dict[str, dict[str, float]](), list[str](), list[str]()
+    box = dict[str, dict[str, float]]()
     for p in found:
         wider = p.bound + 2 * (p.beyond - p.bound)  # as much again beyond the fit
         wider = wider if wider * p.bound >= 0 else kept * p.bound
         box.setdefault(p.name, {})[p.side] = wider
-        said.append(f"{p.name} at its {p.side} bound {p.bound:.6g}")
-        ends.append(f"{p.name}: {wider:.4g}")
-    reason = f"{listed(said)}, and with a wider prior no effect is needed; widen it to "
     details = {"bounds": [*map(asdict, found)], "box": box}
-    return Gate("OUT_OF_PRIOR", reason + ", ".join(ends), details)
+    return _decided(report, "OUT_OF_PRIOR", "bounds", details)
 
 
 def _wrong(report: Contents) -> Gate:
     """Return that effects do not lower the error, or that something is missing."""
     tracing, effects = report.tracing, [*report.tracing.chosen]
-    before, after = tracing.refuted or report.rmse
-    errors = f"{number(before)} to {number(after)}"
+    assert report.evaluation is not None
+    before, after = tracing.refuted or report.evaluation.rmse
     details = {"effects": effects, "before": before, "after": after}
     if tracing.refuted or (effects and not after < before):
-        name = tracing.instead_of or str(ModelKey(tracing.chosen))
-        reason = f"{name} does not lower the error on trials that had no part in the "
-        return Gate("NO_IMPROVEMENT", f"{reason}fit: {errors}", details)
-    others, worst = not_told_from(tracing, effects), _worst(report)
-    if effects and not tracing.beside:
-        which = "which no permitted action tells from it"
-        also = f", or {', '.join(others)}, {which}" if others else ""
-        reason = f"the simulator lacks {report.verdict}{also}; with it the error goes "
-        reason += f"from {errors}; add it and ask again"
-    else:
-        helping = f"; {ModelKey(tracing.beside)} helps" if tracing.beside else ""
-        reason = f"the simulator misses the trials ({report.verdict}){helping}; most "
-        reason += f"in trial {worst['trial']}"
-    return Gate("WRONG_MODEL", reason, {**details, "or": others, "worst": worst})
+        return _decided(report, "NO_IMPROVEMENT", "no lower", details)
+    details |= {"or": tracing.same if effects else [], "worst": report.worst[0]}
+    case = "named" if effects and not tracing.beside else "missing"
+    return _decided(report, "WRONG_MODEL", case, details)
 
 
 def _hardly_known(report: Contents, *, limit: float = 0.5) -> list[str]:

@@ -59,31 +59,30 @@ def missed_trials(
     Returns:
         Farthest first.
     """
-    m, misfit = after.measurements, tracing.misfit
-    own, tails = np.sqrt((after.sd**2).mean(0)), []
+    m, misfit, num = after.measurements, tracing.misfit, len(trials)
+    own, sizes, tails = np.sqrt((after.sd**2).mean(0)), np.empty(num), []
     unit = own if sensor is None else sensor[m.channel]
     for prediction, model in ((before, NONE), (after, tracing.model)):
-        tail = tails_of(prediction, m.trial)
+        error, tail = (m.x - prediction.middle) / unit, tails_of(prediction, m.trial)
+        count = np.maximum(np.bincount(m.trial, minlength=num), 1)
+        square = np.bincount(m.trial, error**2, num) / count
         if misfit is not None:
-            error = (m.x - prediction.middle) / unit
-            among = error, m.trial, len(trials), misfit.of(model).parts
-            tail = np.maximum(tail, _beside_others(*among))
-        tails.append(np.where(_is_sure_of_none(prediction), 0.0, tail))
-    share, missed = level / len(trials), []
-    for t in np.flatnonzero(tails[1] < share).tolist():
-        at = m.trial == t
-        error = (m.x - after.middle)[at] / unit[at]
-        trial = MissedTrial(
+            others = np.array(misfit.of(model).parts)
+            logs = (np.log(np.maximum(each, 1e-300)) for each in (square, others))
+            tail = np.maximum(tail, _beyond(*logs))
+        is_sure_of_none = prediction.probability_valid.max(0) == 0
+        tails.append(np.where(is_sure_of_none, 0.0, tail))
+        sizes = np.where(is_sure_of_none, np.inf, np.sqrt(square))
+    missed = [
+        MissedTrial(
             position=t,
             name=trials.names[t],
-            size=np.inf
-            if _is_sure_of_none(after)[t]
-            else float((error**2).mean() ** 0.5),
+            size=float(sizes[t]),
             p_value=float(tails[1][t]),
-            by_both=bool(tails[0][t] < share),
-            unit="of its deviations" if sensor is None else "sensor deviations",
+            by_both=bool(tails[0][t] < level / num),
         )
-        missed.append(trial)
+        for t in np.flatnonzero(tails[1] < level / num).tolist()
+    ]
     return (*sorted(missed, key=lambda trial: -trial.size),)
 
 
@@ -146,25 +145,3 @@ def tails_of(prediction: Prediction, part: NDArray[np.int64]) -> Array:
         scale = variance / (2 * mean)
         found[t] = chi2.sf((own[at] ** 2).sum() / scale, mean / scale)
     return found
-
-
-def _is_sure_of_none(prediction: Prediction) -> NDArray[np.bool_]:
-    """Return the trials to which no draw gives a measurement, (t,)."""
-    return prediction.probability_valid.max(0) == 0
-
-
-def _beside_others(
-    error: Array, trial: Array, num: int, others: Sequence[float]
-) -> Array:
-    """Return the tail of each trial's error among those of left-out ones, (t,).
-
-    Args:
-        error: Error of each number, in sensor deviations, shape (N,).
-        trial: Trial of each number, shape (N,).
-        num: Number of trials.
-        others: Mean squared errors of left-out trials.
-    """
-    total = np.bincount(trial, error**2, num)
-    square = total / np.maximum(np.bincount(trial, minlength=num), 1)
-    logs, known = (np.log(np.maximum(each, 1e-300)) for each in (square, others))
-    return _beyond(logs, known)

@@ -96,8 +96,8 @@ class Prediction:
         measurements: The measurements that are predicted.
         valid: Whether each trial has an outcome, one draw each, shape (n, t), bool.
         probability_valid: Probability that it has one, given the draw, shape (n, t).
-        at_best: Noise-free prediction by the best fit, shape (N,), where every model
-            misses; None otherwise.
+        middle: Prediction that errors refer to, shape (N,): that of the best fit where
+            every model misses, else the mean.
     """
 
     mean: Array
@@ -107,12 +107,7 @@ class Prediction:
     measurements: Measurements
     valid: Array
     probability_valid: Array
-    at_best: Array | None = None
-
-    @property
-    def middle(self) -> Array:
-        """Prediction that errors refer to: that of the best fit, or the mean, (N,)."""
-        return self.mean.mean(0) if self.at_best is None else self.at_best
+    middle: Array
 
     @property
     def log_density(self) -> Array:
@@ -256,7 +251,7 @@ def predict(
         m.part(kept),
         rng.uniform(size=probability.shape) < probability,
         probability,
-        None if at_best is None else at_best[kept],
+        mean[:, kept].mean(0) if at_best is None else at_best[kept],
     )
 
 

@@ -64,7 +64,7 @@ def test_a_chosen_trial_tells_a_cause_from_its_exact_alias(name, seed):
     assert report.stopped == "settled"
     assert len(robot.asked) <= 3
     assert min(robot.asked) < 0
-    assert report.num_trials == len(FORWARD) + len(robot.asked)
+    assert len(report.residuals.index) == len(FORWARD) + len(robot.asked)
     assert all(trial.after for trial in report.tested)
 
 
@@ -77,8 +77,8 @@ def test_the_alias_is_withdrawn_by_the_rule_that_named_it():
     report = loop(robot, trials, effects=[EVEN])
     assert report.verdict != "lift"
     first = report.tested[0]
-    assert (first.registered.verdict, first.held) == ("lift", False)
-    assert first.distance > 3 * first.registered.limit
+    assert (first.verdict, first.held) == ("lift", False)
+    assert first.distance > 3 * first.limit
     assert "failed" in str(report)
 
 
@@ -93,7 +93,7 @@ def test_a_registered_prediction_is_that_of_linear_least_squares():
     robot = Robot(FORMS["drag"], seed=4)
     trials = robot.trials()
     report = loop(robot, trials, effects=[ODD], max_trials=1)
-    own = report.tested[0].registered
+    own = report.tested[0]
     design = torch.cat([FORWARD, FORMS["drag"](FORWARD)], 1).double()
     new = torch.tensor([float(own.action[0])]).double()
     new = torch.stack([new, FORMS["drag"](new)], 1)
@@ -123,7 +123,7 @@ def test_an_effect_is_withdrawn_by_the_rule_that_named_it():
         evaluate=False,
     )
     (trial,) = report.tested
-    own, remaining = trial.registered, Rule().remaining
+    own, remaining = trial, Rule().remaining
     assert report.tracing.misfit.named == (*own.without,) == ("lag",)
     assert trial.held
     # As wide as errors on left-out trials, which t of few trials widens.
@@ -132,8 +132,8 @@ def test_an_effect_is_withdrawn_by_the_rule_that_named_it():
 
     def off(share):
         """Return a trial in which the effect leaves a share of the squared error."""
-        new = replace(own, without={"lag": own.mean + own.sd * (1 + share**-0.5)})
-        return replace(trial, registered=new, x=own.mean + own.sd)
+        without = {"lag": own.mean + own.sd * (1 + share**-0.5)}
+        return replace(own, without=without, x=own.mean + own.sd)
 
     def after(*tested):
         return choice.unless_unproven(replace(report, tested=tested), remaining)
@@ -143,10 +143,9 @@ def test_an_effect_is_withdrawn_by_the_rule_that_named_it():
         assert after(*tested).verdict == "lag"
     for tested in ([off(1.1 * remaining)], [off(0.2), off(0.4)]):
         assert after(*tested).verdict == "unexplained"
-    own_exact = replace(own, without={"lag": own.mean})
-    exact = replace(trial, registered=own_exact, x=own.mean)
+    exact = replace(own, without={"lag": own.mean}, x=own.mean)
     assert after(exact).verdict == "unexplained"  # without it predicted as well
-    found = after(replace(trial, registered=replace(own, without={})))
+    found = after(replace(own, without={}))
     assert (found.verdict, found.tracing.beside) == ("unexplained", ("lag",))
     assert found.tracing.key == report.tracing.key  # it still predicts
     assert choice.probability_of(found) == 0.0
@@ -207,7 +206,7 @@ def test_a_trial_comes_after_those_that_were_held_out():
     role = ["fit"] * len(FORWARD) + ["held out"] * 3
     report = loop(robot, Trials(action, x, role=role), evaluate=True)
     assert report.verdict == "drag"
-    assert [t.registered.index for t in report.tested][0] == len(action)
+    assert [t.index for t in report.tested][0] == len(action)
     assert report.evaluation.scheme == "held out"
     table = report.before_after.set_index("metric")
     assert table.loc["rmse", "ratio"] < 0.5

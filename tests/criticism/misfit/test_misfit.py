@@ -61,7 +61,7 @@ def test_the_cause_is_named_beside_what_nobody_declared(named):
 @pytest.mark.parametrize("effects", [{}, {"friction": 0.2}])
 def test_a_model_that_fits_to_the_sensor_needs_none_of_it(effects):
     found = loop(trials(**effects))
-    assert found.misfit() is None
+    assert found.trace().misfit is None
     assert found.trace().verdict == (" + ".join(effects) or "none")
 
 
@@ -118,14 +118,14 @@ def test_held_out_errors_are_told_number_by_number_as_left_out_ones_are():
 
 def test_residuals_are_those_of_the_best_fit(named):
     """Draws as wide as the misfit leave the valley that parameters make up for."""
-    key, search = named.trace().key, named.misfit().search
+    key, search = named.trace().key, named._verdict.search
     left = find_residuals(named.rivals, key)
     own = (left.x - left.mean).ravel()[search.errors.measurements.position]
     assert own == pytest.approx(search.unit * search.model(key).residual, abs=1e-6)
 
 
 def test_predictions_are_as_wide_as_left_out_errors_say(named):
-    key, found = named.trace().key, named.misfit()
+    key, found = named.trace().key, named._verdict
     model, errors, num = found.model(key), found.search.errors, 2_000
     rows = found.search.unit[:, None] * model.rows[: model.num, 1:]
     spread = spread_of(found, key)

@@ -1,6 +1,6 @@
 """A report of a machine that lacks a drag, and what changes make of it."""
 
-from dataclasses import fields, replace
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -9,7 +9,6 @@ from sbi.utils import BoxUniform
 from sbi_active import DiscreteActions, SimulatorModel
 from sbi_active.criticism import Trials, close_loop, results
 from sbi_active.criticism.contradictions import Misfit, ModelError, Support
-from sbi_active.criticism.report.report import build_report
 from tests.effects import added, on_outcomes
 
 DRAG = on_outcomes(
@@ -40,8 +39,6 @@ MADE = close_loop(
     effects=[DRAG, added("tilt", torch.abs)],
     actions=ACTIONS,
 )
-FOUND = {"warnings", "num_trials", "action_labels", "action_is_label", "channel_names"}
-PARTS = {f.name: getattr(MADE, f.name) for f in fields(MADE) if f.name not in FOUND}
 
 
 def tracing(verdict: str = "drag", **changes) -> results.Tracing:
@@ -68,8 +65,6 @@ def misfit(left_out, held_out=(None, None), *, sensor=(0.005,)) -> Misfit:
         support={"drag": Support(inclusion=0.9, better=0.9, gained=9.0, remains=0.9)},
         sensor=np.array(sensor),
         passes=False,
-        size=40.0,
-        time_scale=1.0,
     )
 
 
@@ -88,8 +83,9 @@ def residuals(
         refitted=z,
         correlation=0.8 if times is not None else 0.0,
         noise="declared",
+        names=(*map(str, range(num)),),
     )
 
 
 def report(**changes):
-    return build_report(**({"trials": FITTED, "actions": ACTIONS} | PARTS | changes))
+    return replace(MADE, **({"trials": FITTED} | changes))

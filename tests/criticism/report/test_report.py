@@ -10,7 +10,6 @@ import torch
 from matplotlib import image
 
 from sbi_active.criticism.contradictions import SevereTest
-from sbi_active.criticism.report.sections import head
 from sbi_active.display.panels import AFTER, BEFORE, plot_residuals
 from tests.criticism.report.reports import DRAG, report, residuals, tracing
 from tests.display.browser import Parsed
@@ -32,7 +31,8 @@ def test_a_report_goes_through_json_with_all_sections():
     made = report(severe_tests=TESTS)
     again = json.loads(json.dumps(made.to_dict(), allow_nan=False))
     assert again["verdict"] == "drag"
-    assert " ".join(again["summary"]) == " ".join(head(made)[1:])
+    (summary,) = again["summary"]
+    assert summary in " ".join(str(made).split())
     assert again["next_action"]["candidates"][-1] == [3.0]
     assert len(again["residuals_by_trial"]) == 8
     titles = [section["title"] for section in again["sections"]]
@@ -66,14 +66,14 @@ def test_markdown_tables_have_as_many_cells_as_headings():
 
 def test_save_writes_the_page_and_every_figure(tmp_path):
     page = report().save(tmp_path / "out")
-    pictures = {"residuals.png", "before_after.png"}
+    pictures = {"residuals.png"}
     names = {path.name for path in page.parent.iterdir()}
     assert names == {"report.txt", "report.md", "report.html"} | pictures
     linked = re.findall(r"\]\((.+?)\)", (page.parent / "report.md").read_text())
     assert {*linked} == pictures
     elements = Parsed(page.read_text()).elements  # the page needs no other file
     images = [own["src"] for tag, own in elements if tag == "img"]
-    assert len(images) == 2
+    assert len(images) == 1
     assert all(source.startswith("data:image/svg+xml;base64,") for source in images)
     assert all(own.get("href", "#").startswith("#") for _, own in elements)
     assert not any(tag == "script" and "src" in own for tag, own in elements)

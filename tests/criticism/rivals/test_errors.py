@@ -161,8 +161,8 @@ def test_the_loop_names_an_effect_beside_errors_of_unknown_size_in_two_units(dra
     tracing = Criticism(model, prior, trials, effects=effects, seed=0).trace()
     assert tracing.verdict == ("drag" if drag else "none")
     if drag:
-        (phi,) = (e for e in tracing.estimates if e.name == "drag")
-        assert abs(phi.mean - drag) < 4 * phi.sd
+        phi, sd = tracing.evidences["drag"].moments["drag"]
+        assert abs(phi - drag) < 4 * sd
 
 
 # The residual process against Gaussians of the stated covariance
