@@ -99,9 +99,15 @@ def test_a_trial_that_bends_the_fit_to_all_stands_for_no_effect(fn, truth, kind,
     prior = BoxUniform(torch.tensor([0.5, 0.0]), torch.tensor([6.0, 2.0]))
     effects = generic_effects(model, actions)
     given = model, prior, Trials(action, x)
-    found = Criticism(*given, effects=effects, actions=actions).trace()
+    loop = Criticism(*given, effects=effects, actions=actions)
+    found = loop.trace()
     assert found.verdict == "outlier"
     assert credible_set(found.outliers) == (float(wrong),)
+    made = loop.report(plan=False)
+    scores = made.evaluation.before["rmse"], made.evaluation.after["rmse"]
+    # The noise, and what the wrong trial does to most others.
+    assert scores[1].median() < 0.03 < scores[0].median()
+    assert made.rmse_of_others[1] < made.rmse_of_others[0]
 
 
 def test_what_nothing_explains_ends_no_loop():

@@ -146,9 +146,10 @@ def _linear(
     states, search = found.states, found.search
     known = None if use is None else use[search.errors.fold]
     rival = models.rival(key, suspect=found.suspect if key.error == OUTLIER else None)
-    model = search.model(states.predicting(key))
-    if not found.is_missed:
-        model = states.candidate(found.beside(key)).model
+    state = key  # the bare model is what there was before
+    if key.effects and found.beside(key).error == OUTLIER:
+        state = found.beside(key)
+    model = states.candidate(state).model
     seed = derive_seed(models.seed, "linear", str(model.key))
     best, spread = None, None
     linear: Callable[[Array], Array] | None = None
@@ -165,10 +166,8 @@ def _linear(
         log_z = search.found[key].beside.log_evidence
         u, spread = drawn(best, found.covariance(key)), spread_of(found, key, use)
     else:
-        at = states.mixture(key, use)
-        log_z, beside = at.log_evidence, found.beside(key)
-        if beside.error == OUTLIER:
-            at = states.mixture(beside, use)
+        at, own = (states.mixture(each, use) for each in (state, key))
+        log_z = own.log_evidence
         u = drawn(at.mean if best is None else best, at.cov)
         if best is None:
             linear = partial(_residual, search.unit, model)

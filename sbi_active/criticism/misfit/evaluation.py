@@ -14,6 +14,7 @@ from sbi_active.criticism.misfit.draws import posterior
 from sbi_active.criticism.misfit.verdict import Verdict
 from sbi_active.criticism.results import (
     NONE,
+    OUTLIER,
     SCATTER,
     UNEXPLAINED,
     Evaluation,
@@ -120,6 +121,8 @@ def _predicting(found: Verdict, key: ModelKey) -> ModelKey:
     Where all trials scatter, errors are larger than declared in each fold: without one
     of few trials the others may not show it.
     """
+    if key.error == OUTLIER:
+        return key
     scatters = SCATTER in (key.error, found.key.error)
     if not scatters or found.is_missed or found.states.louder(key):
         return ModelKey(key.effects)

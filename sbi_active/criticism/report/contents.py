@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import torch
+from numpy.typing import NDArray
 from scipy.stats import spearmanr
 from torch.distributions import Distribution
 
@@ -17,6 +18,7 @@ from sbi_active.criticism.data.columns import split
 from sbi_active.criticism.data.trials import Trials
 from sbi_active.criticism.results import (
     NONE,
+    OUTLIER,
     UNEXPLAINED,
     Array,
     Detection,
@@ -26,10 +28,8 @@ from sbi_active.criticism.results import (
     Residuals,
     Tracing,
 )
-from sbi_active.identifiability.known import (
-    Combinations,
-    combinations_of_draws,
-)
+from sbi_active.criticism.steps.detection import credible_set
+from sbi_active.identifiability.known import Combinations, combinations_of_draws
 from sbi_active.seeding import forked_generators
 from sbi_active.simulation.model import SimulatorModel
 
@@ -294,13 +294,29 @@ class Contents:
         they are not declared; in those of the prediction.
         """
         found = self.residuals_after or self.residuals
-        left, in_predictions = found.x - found.mean, root_mean_square(found.refitted)
-        left = by_channel(left, found)
+        kept = self._agreeing(found.names)
+        in_predictions = root_mean_square(found.refitted[kept])
+        left = by_channel(found.x - found.mean, found)[kept]
         own, sensor = root_mean_square(left, (0, 1)), self.sensor
         if sensor is None or sensor.shape not in ((1,), own.shape):
             return own, None, float(in_predictions)
         own = own if len(sensor) > 1 else root_mean_square(left)[None]
         return own, own / sensor, float(in_predictions)
+
+    @property
+    def rmse_of_others(self) -> tuple[float, float]:
+        """RMSE before and after over the scored trials that have no gross error."""
+        assert self.evaluation is not None
+        kept = self._agreeing(self.evaluation.names)
+        scores = self.evaluation.before, self.evaluation.after
+        each = [s.loc[kept, ["square", "count"]].sum().to_numpy() for s in scores]
+        before, after = (float(np.sqrt(square / count)) for square, count in each)
+        return before, after
+
+    def _agreeing(self, names: Sequence[str]) -> NDArray[np.bool_]:
+        """Return a mask of trials by name: all but those of an outlier, shape (t,)."""
+        wrong = credible_set(self.tracing.outliers) if self.verdict == OUTLIER else ()
+        return ~np.isin(names, self.called(wrong))
 
     @property
     def sensor(self) -> Array | None:
