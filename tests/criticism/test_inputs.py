@@ -61,8 +61,9 @@ def test_a_function_of_one_row_gets_its_own_inputs():
     shapes = []
 
     def one(theta, action, rng, *, inputs, times, input_times, start):
-        shapes.append((inputs["u"].shape, times.shape, input_times.shape, start.shape))
-        return theta * inputs["u"].sum() + start[0]
+        each = inputs["u"], times, input_times, start["q"]
+        shapes.append(tuple(part.shape for part in each))
+        return theta * inputs["u"].sum() + start["q"]
 
     model = SimulatorModel(one, noise=0.1, batched=False)
     trials = Trials(
@@ -71,12 +72,12 @@ def test_a_function_of_one_row_gets_its_own_inputs():
         sample_times=[0.5],
         inputs={"u": torch.tensor([[1.0, 2.0, 0.0], [3.0, 4.0, 0.0]])},
         input_times=[0.0, 0.5, 1.0],
-        start=torch.tensor([[1.0, 0.0], [2.0, 0.0]]),
+        start={"q": [1.0, 2.0]},
     )
     simulator = TrialSimulator(AugmentedSimulator(model, []), trials)
     mean, _, _ = simulator.predict(torch.ones(1, 1), {})
     assert mean.tolist() == [[4.0, 9.0]]
-    assert {*shapes} == {((3,), (1,), (3,), (2,))}
+    assert {*shapes} == {((3,), (1,), (3,), ())}
 
 
 def falling(theta, action, *, times):  # which cannot do without them

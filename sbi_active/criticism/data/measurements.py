@@ -71,23 +71,17 @@ class Measurements:
         require(stamps.shape[-1] == length, expected, f"shape {x.shape[1:]}", advice)
         # (trial, channel, time), where x without a time axis has one "time" a channel.
         channels = x.reshape(num, length, -1).transpose(0, 2, 1)
-        places = np.arange(x.size).reshape(num, length, -1).transpose(0, 2, 1)
-        trial, channel, _ = np.indices(channels.shape)
         stamps = np.broadcast_to(stamps, (num, length))
-        time = np.broadcast_to(stamps[:, None], channels.shape)
+        keep = np.isfinite(channels) & np.isfinite(stamps)[:, None]
+        trial, channel, place = np.nonzero(keep)
+        size = x.size // num
+        position = trial * size + place * channels.shape[1] + channel
+        time = stamps[trial, place]
         if not has_time:
-            time, channel = np.zeros(channels.shape), places % (x.size // num)
-        keep = np.isfinite(channels) & np.isfinite(time)
-        return cls(
-            channels[keep],
-            places[keep],
-            trial[keep].astype(np.int64),
-            channel[keep].astype(np.int64),
-            time[keep],
-            has_time,
-            np.asarray(np.isfinite(x.reshape(num, -1)).any(1)),
-            x.shape,
-        )
+            time, channel = 0 * time, position % size
+        valid = np.asarray(np.isfinite(x.reshape(num, -1)).any(1))
+        numbers = channels[keep], position, trial, channel, time
+        return cls(*numbers, has_time, valid, x.shape)
 
     @cached_property
     def gap(self) -> Array:

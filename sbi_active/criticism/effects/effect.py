@@ -38,14 +38,14 @@ class Context:
         times: Sample times, shape (k,) or (n, k); None for x without a time axis.
         inputs: Inputs as commanded, {name: (n, m)}; None for trials without.
         input_times: Uniform grid of the inputs, shape (m,).
-        start: Measured start states, shape (n, d) or {name: (n,)}; None for none.
+        start: Measured start states, {name: (n,)}; None for none.
     """
 
     index: Tensor
     times: Tensor | None = None
     inputs: dict[str, Tensor] | None = None
     input_times: Tensor | None = None
-    start: Tensor | dict[str, Tensor] | None = None
+    start: dict[str, Tensor] | None = None
 
     def at(self, rows: slice) -> Context:
         """Return the context of some rows."""

@@ -90,12 +90,6 @@ def start_from_first_samples(
         >>> nuisance.scope, nuisance.phi_dim
         ('trial', 2)
     """
-    known = {} if trials.start is None else trials.start
-    if not isinstance(known, dict):
-        raise ValueError(
-            "expected measured start states by name; got an array; pass "
-            "Trials(start={name: ...}), whose names the simulator tells apart"
-        )
     wanted = [(v, 0) if isinstance(v, int) else v for v in start.values()]
     degree = max([1, *[order for _, order in wanted]])
     values, errors, p_value = _fitted(trials, wanted, degree, within, sd, at)
@@ -108,7 +102,7 @@ def start_from_first_samples(
         )
     copy = trials.select(slice(None))
     shown = dict(zip(start, torch.from_numpy(values.T.copy()), strict=True))
-    copy.start = {**known, **shown}
+    copy.start = {**(trials.start or {}), **shown}
     copy.repeat_of = repeated(copy.settings())
     scale = torch.from_numpy(width * errors.max(0))  # of the trial that tells least
     prior = Independent(Normal(torch.zeros_like(scale), scale), 1)
