@@ -31,7 +31,7 @@ def loop(*effects, model=MODEL):
 
 #: Parts that are none, and what is said of them.
 NO_PARTS = [
-    ({"null": NAN}, "expected a null of effect 'bias'; got NaN"),
+    ({"null": NAN}, "expected a null of effect 'bias' .*; got nan"),
     ({"null": [0.0, 0.0]}, r"expected a null of effect 'bias' of shape \(1,\)"),
     ({"prior": 1.0}, "expected a continuous torch prior of effect 'bias'"),
     ({"prior": LogNormal(0.0, 200.0)}, "expected finite draws .*; got NaN or inf"),
