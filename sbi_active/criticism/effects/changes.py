@@ -124,26 +124,12 @@ def played(u: Tensor, width: Tensor) -> Tensor:
         u: Series, shape (n, m); it starts in the middle of the play.
         width: w, shape (n, 1).
     """
-    half = width.clamp(min=0) / 2
-    low, high = u - half, u + half
-    # To hold y within limits, and then within further ones, is to hold it within both.
-    shift = 1
-    while shift < u.shape[1]:
-        first, later = slice(None, -shift), slice(shift, None)
-        low, high = (
-            torch.cat(
-                [
-                    part[:, :shift],
-                    torch.minimum(
-                        torch.maximum(part[:, first], low[:, later]), high[:, later]
-                    ),
-                ],
-                1,
-            )
-            for part in (low, high)
-        )
-        shift *= 2
-    return torch.minimum(torch.maximum(u[:, :1], low), high)
+    half = width.clamp(min=0)[:, 0] / 2
+    places = [u[:, 0]]
+    for each in u[:, 1:].unbind(1):
+        held = torch.maximum(places[-1], each - half)
+        places.append(torch.minimum(held, each + half))
+    return torch.stack(places, 1)
 
 
 def lagged_samples(x: Tensor, tau: Tensor, times: Tensor) -> Tensor:

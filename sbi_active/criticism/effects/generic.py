@@ -70,19 +70,18 @@ def generic_effects(
     )
     sd = None if model.noise is None else model.noise.declared_sds()
     draws = None if prior is None else _prior_draws(model, actions, prior)
-    times, signals, trials = model.sample_times, model.inputs, None
-    inputs, grid = None, None
+    trials = actions if isinstance(actions, Trials) else None
+    times, inputs, grid, signals = model.sample_times, None, None, model.inputs
     if isinstance(actions, Trials):
-        trials, inputs, grid = actions, actions.inputs, actions.input_times
-        values, units = trials.action, [_unit(n) for n in trials.action_labels or ()]
+        inputs, grid, values = actions.inputs, actions.input_times, actions.action
+        units = [split(label)[1] for label in actions.action_labels or ()]
         times = times if has_own_times(model, actions) else actions.sample_times
     else:
         values, units = actions.sample((NUM_ACTIONS,), seed=0).double(), actions.units
+    if signals is not None and inputs is None:
+        inputs, grid = signals.inputs(values), signals.input_times
     found = []
-    if signals is not None:
-        if inputs is None:
-            inputs, grid = signals.inputs(values), signals.input_times
-    elif trials is None or not trials.action_is_label:
+    if signals is None and (trials is None or not trials.action_is_label):
         unit = units[0] if len({*units}) == 1 else ""
         words = {"who": "the action", "before": "", "unit": unit}
         sizes = _command(values.float().double())  # an executed action is single
@@ -92,20 +91,23 @@ def generic_effects(
         labels = None if trials is None else trials.input_labels
         found += _of_inputs(inputs, labels, delay)
     late: dict[str, Tensor] = {}
-    if times is not None and trials is None and inputs is None:
-        late = {"late": torch.tensor([LATE * float(times.max() - times.min())])}
-    elif times is not None:
+    if times is not None:
         far = times.nan_to_num(-torch.inf).max() - times.nan_to_num(torch.inf).min()
         late = {"span": far, "delay": torch.tensor([typical_delay(times)])}
-    if trials is None or times is None:
-        return [*found, *_of_sensor(sd, draws, late)]
-    names = trials.channel_labels or model.channel_names
-    return [*found, *_of_sensors(trials.x, names, sd, draws, late)]
-
-
-def _unit(label: str) -> str:
-    """Return what stands in the brackets of a label."""
-    return split(label)[1]
+        if trials is None and inputs is None:
+            late = {"late": torch.tensor([LATE * float(far)])}
+    sensors: list[tuple[str, int | None]] = [("", None)]
+    if trials is not None and times is not None:
+        num = 1 if trials.x.ndim == 2 else trials.x.shape[2]
+        if trials.x.ndim == 3 and 1 < num <= 4:
+            names = trials.channel_labels or model.channel_names
+            names = names or [f"x {j + 1}" for j in range(num)]
+            sensors = [(split(name)[0], j) for j, name in enumerate(names)]
+        elif num == 1 and sd is not None:
+            sd = sd.mean().reshape(1)  # a sample is no channel
+    for name, channel in sensors:
+        found += _of_sensor(sd, draws, late, name, channel)
+    return found
 
 
 def typical_delay(times: Tensor) -> float:
@@ -165,31 +167,10 @@ def _of_inputs(
         sizes = _command(value[value.isfinite()].double()[:, None])
         if bool((value.diff(dim=1) != 0).any()):
             sizes |= {"play": sizes["range"], "delay": torch.tensor([delay])}
-        words = {"who": f"the input {name}", "before": before, "unit": _unit(label)}
+        unit = split(label)[1]
+        words = {"who": f"the input {name}", "before": before, "unit": unit}
         own = before or "input"
         found += _made("command", "input", own, sizes, words, inputs=(name,))
-    return found
-
-
-def _of_sensors(
-    x: Tensor,
-    names: Sequence[str] | None,
-    sd: Tensor | None,
-    draws: tuple[Tensor, Tensor] | None,
-    late: Mapping[str, Tensor],
-) -> list[Effect]:
-    """Return effects of one sensor, or of each of up to four with their own series."""
-    num = 1 if x.ndim == 2 else x.shape[2]
-    if num == 1 or x.ndim > 3 or num > 4:
-        if num == 1 and sd is not None:
-            sd = sd.mean().reshape(1)  # a sample is no channel
-        return _of_sensor(sd, draws, late)
-    found = []
-    for j, label in enumerate(names or [f"x {j + 1}" for j in range(num)]):
-        own = None if sd is None else sd[[j if len(sd) == num else 0]]
-        part = draws and (draws[0][..., [j]], draws[1][..., [j]])
-        name = label.partition(" [")[0]
-        found += _of_sensor(own, part, late, name, f"{name}: ", channel=j)
     return found
 
 
@@ -197,9 +178,8 @@ def _of_sensor(
     sd: Tensor | None,
     draws: tuple[Tensor, Tensor] | None,
     late: Mapping[str, Tensor],
-    label: str = "",
-    at: str = "",
-    **wrapped: Any,
+    label: str,
+    channel: int | None,
 ) -> list[Effect]:
     """Return effects on an observation.
 
@@ -208,9 +188,11 @@ def _of_sensor(
         draws: Draws of x, twice; None if no prior is known.
         late: Sizes of what acts in time.
         label: Name of the sensor.
-        at: Beginning of the sentences.
-        **wrapped: Entry of x's last axis that is changed.
+        channel: Entry of x's last axis that it reads; None for all of x.
     """
+    if channel is not None:
+        sd = None if sd is None else sd[[channel if len(sd) > channel else 0]]
+        draws = draws and (draws[0][..., [channel]], draws[1][..., [channel]])
     sizes = dict(late)
     if draws is not None:
         x, again = draws
@@ -222,7 +204,8 @@ def _of_sensor(
         sd = within if sd is None else sd
     assert sd is not None
     sizes |= {"noise": sd, "one": torch.ones_like(sd)}
-    return _made("sensor", "observation", label, sizes, {"at": at}, **wrapped)
+    words = {"at": f"{label}: " if label else ""}
+    return _made("sensor", "observation", label, sizes, words, channel=channel)
 
 
 def _prior_draws(
