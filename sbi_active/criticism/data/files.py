@@ -26,36 +26,29 @@ def find_recordings(folder: Path) -> list[Path]:
         return [folder / TABLE]
     # Copies to other systems leave files of attributes, "._run.csv".
     visible = (p for p in folder.glob("*.csv") if not p.name.startswith("."))
-    found = sorted(visible, key=lambda path: _natural(path.name))
+    found = sorted(visible, key=_natural)
     got = f"no {TABLE} and no other *.csv"
     require(bool(found), f"recordings in {folder}", got, "write one, or one a trial")
     return found
 
 
-def _natural(name: str) -> list[tuple[int, str]]:
+def _natural(path: Path) -> list[int | str]:
     """Return a key by which run_2 comes before run_10."""
-    parts = re.split(r"(\d+)", name)
-    return [(int(part), "") if part.isdigit() else (-1, part) for part in parts]
+    parts = re.split(r"(\d+)", path.name)  # text and numbers in turn
+    return [int(part) if k % 2 else part for k, part in enumerate(parts)]
 
 
 def read_csv(path: Path) -> pd.DataFrame:
     """Return a CSV file as text, its first row as the names of the columns."""
-    if not path.is_file():
-        raise FileNotFoundError(
-            f"expected a CSV file; got none at {path}; check the path"
-        )
     try:
         with path.open(encoding="utf-8-sig", newline="") as file:
             # A "#" within a cell is a part of it: only whole lines are comments.
             lines = [line for line in file if not line.lstrip().startswith("#")]
         first = next((line.strip() for line in lines if line.strip()), "")
-        require(
-            "," in first or not {*";\t"} & {*first},
-            "cells separated by commas",
-            f"{first!r} in {path}",
-            "save the table with commas and decimal points, or pass the frame "
-            "pandas.read_csv(path, sep=..., decimal=...)",
-        )
+        advice = "save the table with commas and decimal points, or pass the frame "
+        advice += "pandas.read_csv(path, sep=..., decimal=...)"
+        holds, got = "," in first or not {*";\t"} & {*first}, f"{first!r} in {path}"
+        require(holds, "cells separated by commas", got, advice)
         options: Any = {"header": None, "dtype": str, "keep_default_na": False}
         table = pd.read_csv(io.StringIO("".join(lines)), **options)
     except (UnicodeError, ParserError, EmptyDataError) as error:

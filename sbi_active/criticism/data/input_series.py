@@ -31,11 +31,10 @@ ON_TIME = 1e-3
 def inputs_of(
     inputs: Any,
     times: Any,
+    hold: Hold,
     x: Tensor,
     x_times: Tensor | None,
     names: Sequence[str],
-    *,
-    hold: Hold = "previous",
 ) -> tuple[dict[str, Tensor] | None, Tensor | None]:
     """Return the inputs of trials by name, shape (t, m), and their grid, shape (m,).
 
@@ -49,11 +48,11 @@ def inputs_of(
             share, or a list of t arrays; None for none.
         times: Times of the values, shape (m,), (t, m), or a list of t, or a dict of
             such by name; None takes those of x where there are as many.
+        hold: "previous" holds each value until the next one, as a command is held;
+            "linear" draws lines between them.
         x: Observations that were measured, shape (t, k, ...).
         x_times: Times of x, shape (k,) or (t, k).
         names: Names of the trials.
-        hold: "previous" holds each value until the next one, as a command is held;
-            "linear" draws lines between them.
 
     Raises:
         ValueError: If series are none of these, have no times or gaps, begin at very
@@ -170,23 +169,23 @@ def _piece(what: str, values: Tensor, times: Tensor) -> Piece:
     advice = "pass what does not vary in time as the action, action_* in a table"
     require(is_series, f"{expected}, and the time of each", got, advice)
     steps = np.diff(t)
-    for k in np.flatnonzero(steps <= 0):
-        raise ValueError(
-            f"expected input_times that increase; got {t[k + 1]:g} after {t[k]:g} for "
-            f"{what}, value {k + 1}; sort the values by time, and give each trial its "
-            "own times"
-        )
-    for k in np.flatnonzero(steps > GAP * np.median(steps)):
-        raise ValueError(
-            f"expected inputs without gaps; got no value from {t[k]:g} to {t[k + 1]:g} "
-            f"for {what}, where the median step is {np.median(steps):g}; fill in what "
-            "was commanded there, or split the trial"
-        )
+    k, widest, middle = int(np.argmin(steps)), int(np.argmax(steps)), np.median(steps)
+    got = f"{t[k + 1]:g} after {t[k]:g} for {what}, value {k + 1}"
+    advice = "sort the values by time, and give each trial its own times"
+    require(bool(steps[k] > 0), "input_times that increase", got, advice)
+    got = f"no value from {t[widest]:g} to {t[widest + 1]:g} for {what}, where the "
+    got += f"median step is {middle:g}"
+    advice = "fill in what was commanded there, or split the trial"
+    has_no_gap = bool(steps[widest] <= GAP * middle)
+    require(has_no_gap, "inputs without gaps", got, advice)
     return t, u
 
 
 def _grid(pieces: Mapping[str, Sequence[Piece]], names: Sequence[str]) -> Array:
-    """Return the grid; that of all series where it is uniform already."""
+    """Return the grid; that of all series where it is uniform already.
+
+    Raises, or warns, where trials begin long after it: they hold what is first.
+    """
     every = [piece for each in pieces.values() for piece in each]
     first, _ = every[0]
     steps = np.diff(first)
@@ -199,36 +198,22 @@ def _grid(pieces: Mapping[str, Sequence[Piece]], names: Sequence[str]) -> Array:
     )
     begin, end = begin.min(0), end.max(0)  # of each trial
     low, high = begin.min(), end.max()
-    _require_one_origin(begin - low, end - begin, names)
-    # Where the last time is between two steps, the grid goes up to the next.
-    num = max(int(np.ceil((high - low) / step - ON_TIME)), 1)
-    return low + step * np.arange(num + 1)
-
-
-def _require_one_origin(after: Array, span: Array, names: Sequence[str]) -> None:
-    """Raise, or warn, where trials begin long after the grid: they hold what is first.
-
-    Pieces of one record have its clock, and a simulator would run up to each.
-
-    Args:
-        after: Time from the begin of the grid to that of each trial, shape (t,).
-        span: Duration of each trial, shape (t,).
-        names: Names of the trials.
-    """
-    worst = int(np.argmax(after / span))
-    got = f"trial {names[worst]}, which lasts {span[worst]:g} and begins "
-    got += f"{after[worst]:g} after the earliest"
+    # Pieces of one record have its clock, and a simulator would run up to each.
+    after, span = begin - low, end - begin
+    k = int(np.argmax(after / span))
+    got = f"trial {names[k]}, which lasts {span[k]:g} and begins {after[k]:g} after "
+    got += "the earliest"
     remedy = "give the times of each trial, those of x too, from its own begin"
-    is_near, expected = (
-        after[worst] <= span[worst],
-        "trials that begin at similar times",
-    )
+    is_near, expected = after[k] <= span[k], "trials that begin at similar times"
     require(is_near, expected, got, f"{remedy}, and all in one unit")
-    if after[worst] > FAR * span[worst]:
+    if after[k] > FAR * span[k]:
         warn(
             f"SA208 {got}, holds its first input until then: {remedy} where a "
             "simulator starts there",
         )
+    # Where the last time is between two steps, the grid goes up to the next.
+    num = max(int(np.ceil((high - low) / step - ON_TIME)), 1)
+    return low + step * np.arange(num + 1)
 
 
 def _at(grid: Array, times: Array, values: Array, hold: Hold) -> Array:

@@ -64,11 +64,10 @@ class Measurements:
         has_time = is_sequence or stamps is not None
         if stamps is None:
             stamps = np.arange(length, dtype=float)
-        expected = (
-            f"x of {stamps.shape[-1]} samples a trial, as the simulator has times"
-        )
+        each = stamps.shape[-1]
+        expected = f"x of {each} samples a trial, as the simulator has times"
         advice = "measure at these, or give the trials sample_times (columns time)"
-        require(stamps.shape[-1] == length, expected, f"shape {x.shape[1:]}", advice)
+        require(each == length, expected, f"shape {x.shape[1:]}", advice)
         # (trial, channel, time), where x without a time axis has one "time" a channel.
         channels = x.reshape(num, length, -1).transpose(0, 2, 1)
         stamps = np.broadcast_to(stamps, (num, length))

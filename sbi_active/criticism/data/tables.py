@@ -40,7 +40,6 @@ BESIDE = (TRIAL, TIME, "input")
 GAPS = ("x", "input", "repeat_of", "role")
 #: What to do about a trial that is there twice.
 AGAIN = "remove one, or give each its own index where both were executed"
-SHOWN = 5  # places that a message lists
 NONE = np.empty((0, 2))
 
 Source = str | Path | pd.DataFrame
@@ -300,9 +299,8 @@ def arguments_of(table: Table, beside: Table | None = None) -> dict[str, Any]:
         found["role"] = np.where(is_held_out, "held out", "fit").tolist()
     for column in table.of("repeat_of"):
         told, first = table.frame[column], table.constant(column)
-        is_known, advice = told.isna() | (told < 0) | told.isin(index), "give that of "
-        advice += "the first trial of this action"
-        expected = "an index of the table"
+        is_known = told.isna() | (told < 0) | told.isin(index)
+        advice, expected = "give that of the first one", "an index of the table"
         table.require(is_known, column, expected, advice, told)
         place = {value: i for i, value in enumerate(index)}
         found["repeat_of"] = [place.get(value, -1) for value in first]
@@ -327,11 +325,10 @@ def _samples(table: Table) -> Any:
     for column in table.of("x"):
         at = np.flatnonzero(is_noted & frame[column].isna())
         if len(at):
-            some = ", ".join(map(table.place, at[:SHOWN]))
-            more = f" and {len(at) - SHOWN} more" if len(at) > SHOWN else ""
             warn(
                 f"SA203 {len(at)} of {is_sample.sum()} cells of column {column.header} "
-                f"in {source} hold no number: {some}{more}; they count as not measured",
+                f"in {source} hold no number, the first in {table.place(at[0])}; they "
+                "count as not measured",
             )
     return frame[is_sample]
 

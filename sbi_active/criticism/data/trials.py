@@ -127,14 +127,11 @@ class Trials:
         self.action = measured(action, name="action")
         if self.action.ndim == 1:
             self.action = self.action[:, None]
-        shapes = tuple(self.action.shape), tuple(self.x.shape)
-        is_one_each = len(shapes[0]) == 2 and shapes[0][0] == n and 0 not in shapes[0]
-        expected = "actions (n, action_dim) and x with as many rows"
-        got = f"{shapes[0]} and {shapes[1]}"
-        require(is_one_each, expected, got, "give one action a trial")
-        is_finite = bool(self.action.isfinite().all())
-        advice = "give each trial the action that was commanded"
-        require(is_finite, "finite actions", "NaN or inf", advice)
+        shape, lost = tuple(self.action.shape), int((~self.action.isfinite()).sum())
+        is_one_each = len(shape) == 2 and shape[0] == n and 0 not in shape and not lost
+        expected = "finite actions (n, action_dim) and x with as many rows"
+        got = f"{shape} with {lost} that are not finite, and {tuple(self.x.shape)}"
+        require(is_one_each, expected, got, "give each trial what was commanded")
         if self.x.ndim == 1:
             self.x = self.x[:, None]
         if mask is not None:
@@ -152,23 +149,19 @@ class Trials:
         self._names = texts(expected, names, [n], distinct=True)
         self.x = without_inf(self.x, self.names)
         self.sample_times = sample_times_of(sample_times, self.x, self.names)
-        measured_x = (self.x, self.sample_times, self.names)
         self.inputs, self.input_times = inputs_of(
-            inputs, input_times, *measured_x, hold=input_hold
+            inputs, input_times, input_hold, self.x, self.sample_times, self.names
         )
         is_named = start is None or isinstance(start, Mapping)
         expected = "start states as {name: (n,)}"
         require(is_named, expected, type(start), "name each of them")
         advice = "leave these out, or declare an effect of scope 'trial' in its place"
-        parts = {
-            str(k): one_each(str(k), v, n, advice) for k, v in (start or {}).items()
-        }
+        given = (start or {}).items()
+        parts = {str(k): one_each(str(k), v, n, advice) for k, v in given}
         self.start: dict[str, Tensor] | None = parts or None
-        self.repeat_of = (
-            repeated(self.settings())
-            if repeat_of is None
-            else root(one_each("repeat_of", repeat_of, n))
-        )
+        self.repeat_of = repeated(self.settings())
+        if repeat_of is not None:
+            self.repeat_of = root(one_each("repeat_of", repeat_of, n))
         # A trajectory of one channel has no axis for it.
         one = [1] if self.x.ndim == 2 and self.sample_times is not None else []
         self.action_labels, self.input_labels, self.channel_labels = (
@@ -288,12 +281,15 @@ class Trials:
     @property
     def fit(self) -> Trials:
         """The trials that may be fitted."""
-        return self._of("fit")
+        is_fit = torch.tensor([role == "fit" for role in self.role])
+        require(bool(is_fit.any()), "a trial of role 'fit'", "none", "change a role")
+        return self.select(is_fit)
 
     @property
     def held_out(self) -> Trials | None:
         """The held-out trials; None if there are none."""
-        return self._of("held out") if self.held_out_positions else None
+        held = self.held_out_positions
+        return self.select(held) if held else None
 
     def template(self) -> tuple[Tensor, Tensor | None]:
         """Return a trial in which all is measured that any trial has, and its times.
@@ -303,14 +299,14 @@ class Trials:
             sample times, shape (k,), NaN there too, or None.
         """
         x, times = torch.zeros_like(self.x[0]), self.sample_times
-        if times is not None:  # a sample that no trial has, such as one thinned out
-            seen = self.mask.reshape(*self.x.shape[:2], -1).any(-1).any(0)
-            x = x.where(seen.reshape(-1, *[1] * (x.ndim - 1)), torch.nan)
-        if times is None or times.ndim == 1:
-            return x, times
-        longest = times[int(times.isfinite().sum(-1).argmax())]
-        sampled = longest.isfinite().reshape(-1, *[1] * (x.ndim - 1))
-        return x.where(sampled, torch.nan), longest
+        if times is None:
+            return x, None
+        # A sample that no trial has, such as one thinned out, is none.
+        seen = self.mask.reshape(*self.x.shape[:2], -1).any(-1).any(0)
+        if times.ndim > 1:
+            times = times[int(times.isfinite().sum(-1).argmax())]
+            seen = seen & times.isfinite()
+        return x.where(seen.reshape(-1, *[1] * (x.ndim - 1)), torch.nan), times
 
     def select(self, positions: Any) -> Trials:
         """Return some trials, with their indices.
@@ -354,12 +350,6 @@ class Trials:
         times = self.sample_times
         own = ["sample_times"] if times is not None and times.ndim > 1 else []
         return ["action", "x", "index", "inputs", "start", *own]
-
-    def _of(self, role: Role) -> Trials:
-        positions = [i for i, r in enumerate(self.role) if r == role]
-        got = f"none of {len(self)}"
-        require(bool(positions), f"a trial of role {role!r}", got, "change it")
-        return self.select(positions)
 
     def settings(self) -> Tensor:
         """Return all that was set in each trial, shape (n, k); a label is not."""

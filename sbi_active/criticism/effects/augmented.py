@@ -87,8 +87,8 @@ class AugmentedSimulator(SimulatorModel):
         next_index: int = 0,
     ) -> None:
         is_more = isinstance(model, AugmentedSimulator)
-        before = model.effects if is_more else []
-        base = self.base = model.base if is_more else model
+        base, before = (model.base, model.effects) if is_more else (model, [])
+        self.base = base
         self.effects = [*before, *effects]
         require_distinct(self.effects, base.parameter_names or ())
         self.next_index = next_index
@@ -264,12 +264,11 @@ class AugmentedSimulator(SimulatorModel):
         """Return what the simulator's function is told of how its trials are run."""
         context, wanted = rows.context, self.base.conditions
         acting = [e for e in self.effects if e.hook == "input" and e.name in rows.phi]
-        is_known, names = context.inputs is not None, ", ".join(e.name for e in acting)
-        expected = f"inputs over time for {names}, in the trials and in the simulator"
-        got = f"arguments {', '.join(wanted) or 'without'}" if is_known else "no inputs"
+        names = ", ".join(effect.name for effect in acting)
+        is_told = not acting or (context.inputs is not None and "inputs" in wanted)
+        expected = f"inputs over time for {names}, in the trials and the simulator"
         advice = "pass Trials(inputs=...), and take fn(theta, action, *, inputs)"
-        is_told = not acting or (is_known and "inputs" in wanted)
-        require(is_told, expected, got, advice)
+        require(is_told, expected, "none in one of them", advice)
         inputs = self._through("input", context.inputs, rows)
         return replace(context, inputs=inputs).told(wanted)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, Literal, get_args
 
 import torch
@@ -12,10 +12,10 @@ from torch import Tensor
 from torch.distributions import Distribution
 
 from sbi_active.arrays import measured
-from sbi_active.criticism.data.arrays import rows_at
 from sbi_active.expected import require, suggests
 from sbi_active.inference.beliefs.priors import is_discrete
 from sbi_active.seeding import forked_generators
+from sbi_active.simulation.conditions import at_rows
 from sbi_active.support import parts_of, support_of
 
 Hook = Literal["action", "input", "parameter", "dynamics", "observation", "noise"]
@@ -47,16 +47,10 @@ class Context:
 
     def at(self, rows: slice) -> Context:
         """Return the context of some rows."""
-        times = self.times
-        if times is not None and times.ndim > 1:
-            times = times[rows]
-        return replace(
-            self,
-            index=self.index[rows],
-            times=times,
-            inputs=rows_at(self.inputs, rows),
-            start=rows_at(self.start, rows),
-        )
+        known = at_rows(vars(self), rows)
+        if self.times is not None and self.times.ndim == 1:
+            known["times"] = self.times  # of every row
+        return Context(**known)
 
     def told(self, names: Iterable[str]) -> dict[str, Any]:
         """Return those of some conditions that are known, times in each row."""

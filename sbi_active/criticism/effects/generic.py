@@ -16,7 +16,7 @@ from sbi_active.criticism.data.columns import split
 from sbi_active.criticism.data.trials import Trials
 from sbi_active.criticism.effects.changes import Wrapped
 from sbi_active.criticism.effects.effect import Context, Effect, Hook
-from sbi_active.criticism.effects.table import rows_of
+from sbi_active.criticism.effects.table import Sizes, Words, rows_of
 from sbi_active.criticism.effects.trial_conditions import conditions_for, has_own_times
 from sbi_active.expected import require
 from sbi_active.seeding import forked_generators, row_seeds
@@ -62,12 +62,10 @@ def generic_effects(
     Raises:
         ValueError: If neither noise nor prior says how large x and its errors are.
     """
-    require(
-        model.noise is not None or prior is not None,
-        "a simulator with declared noise, or its prior",
-        "neither, so nothing says how large a bias may be",
-        "give prior=",
-    )
+    is_sized = model.noise is not None or prior is not None
+    expected = "a simulator with declared noise, or its prior"
+    got = "neither, so nothing says how large a bias may be"
+    require(is_sized, expected, got, "give prior=")
     sd = None if model.noise is None else model.noise.declared_sds()
     draws = None if prior is None else _prior_draws(model, actions, prior)
     trials = actions if isinstance(actions, Trials) else None
@@ -126,22 +124,19 @@ def typical_delay(times: Tensor) -> float:
 
 
 def _made(
-    of: str,
-    hook: Hook,
-    label: str,
-    sizes: Mapping[str, Any],
-    words: Mapping[str, str],
-    **wrapped: Any,
+    of: str, hook: Hook, label: str, sizes: Sizes, words: Words, **wrapped: Any
 ) -> list[Effect]:
     """Return the effects of the table whose sizes are known."""
-    return [
-        row.made(
-            *(hook, Wrapped(row.changes, **wrapped), label, sizes, words),
-            needs_order=row.changes == "drift by trial",
-        )
-        for row in rows_of(TABLE)
-        if row.of == of and row.is_sized(sizes)
-    ]
+    found = []
+    for row in rows_of(TABLE):
+        if row.of == of and row.is_sized(sizes):
+            how: dict[str, Any] = {
+                "hook": hook,
+                "apply": Wrapped(row.changes, **wrapped),
+            }
+            how["needs_order"] = row.changes == "drift by trial"
+            found.append(row.made(label, sizes, words, **how))
+    return found
 
 
 def _command(some: Tensor) -> dict[str, Tensor]:
@@ -305,11 +300,9 @@ def varying_parameters(
     names = model.parameter_names or [f"theta_{j + 1}" for j in range(len(sd))]
     effects = []
     for j, name in enumerate(names):
+        bounds = float(low[j]), float(high[j])
         for label, unit, entry, center, half in _variables(trials):
-            varied = _Varied(
-                *(j, float(sd[j]), entry, center, half),
-                bounds=(float(low[j]), float(high[j])),
-            )
+            varied = _Varied(j, float(sd[j]), entry, center, half, bounds)
             effects.append(
                 Effect(
                     f"{name} by {label}",
@@ -329,17 +322,17 @@ def varying_parameters(
 
 def _variables(trials: Trials) -> Iterator[tuple[str, str, int | None, float, float]]:
     """Yield name, unit, entry of the action, middle and half range of each variable."""
-    columns = [] if trials.action_is_label else [*trials.action.double().T]
-    plain = [f"action {k + 1}" for k in range(len(columns))]
-    labels = trials.action_labels or (["action"] if len(columns) == 1 else plain)
-    given: list[tuple[str, int | None, Tensor]] = [
-        *zip(labels, range(len(columns)), columns, strict=False)
-    ]
+    dim = trials.action.shape[1]
+    plain = ["action"] if dim == 1 else [f"action {k + 1}" for k in range(dim)]
+    labels = () if trials.action_is_label else trials.action_labels or plain
+    columns: dict[int | None, tuple[str, Tensor]] = {
+        entry: (label, trials.action[:, entry]) for entry, label in enumerate(labels)
+    }
     if trials.order != "unknown":
-        given.append(("trial", None, trials.index.double()))
-    for label, entry, column in given:
+        columns[None] = "trial", trials.index
+    for entry, (label, column) in columns.items():
         low, high = float(column.min()), float(column.max())
         if high > low:
-            name, _, unit = label.partition(" [")
-            unit = f" ({unit.removesuffix(']')})" if unit else ""
+            name, unit = split(label)
+            unit = f" ({unit})" if unit else ""
             yield name, unit, entry, (low + high) / 2, (high - low) / 2

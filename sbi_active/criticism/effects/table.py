@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from functools import cache
@@ -18,6 +18,8 @@ from sbi_active.criticism.effects.effect import Effect
 from sbi_active.expected import did_you_mean, require
 
 Patterns = str | Iterable[str]
+Sizes = Mapping[str, Any]  # by name
+Words = Mapping[str, str]  # in braces, by name
 
 
 def picked(
@@ -79,39 +81,27 @@ class Row:
     sentence: str
     family: str = ""
 
-    def made(
-        self,
-        hook: Any,
-        apply: Callable[..., Any],
-        label: str,
-        sizes: Mapping[str, Any],
-        words: Mapping[str, str],
-        **options: Any,
-    ) -> Effect:
+    def made(self, label: str, sizes: Sizes, words: Words, **options: Any) -> Effect:
         """Return the effect of an element.
 
         Args:
-            hook: Part of the simulator that it changes.
-            apply: Change of that part.
             label: Name of the element.
             sizes: Sizes that the prior is scaled by, by name.
             words: Words in braces, by name.
-            **options: Options of :class:`.Effect`.
+            **options: Hook, ``apply`` and further options of :class:`.Effect`.
         """
         has_unit = words or "{" not in self.unit
         return Effect(
             self.effect.format(label, **words).strip(),
-            hook=hook,
             prior=prior_of(self.prior, self.size, sizes),
             null=torch.inf if "limit" in self.prior else 0.0,
-            apply=apply,
             units=self.unit.format(**words) if has_unit else "",
             family=self.family or None,
             describe=self.sentence.format(label, **words),
             **options,
         )
 
-    def is_sized(self, sizes: Mapping[str, Any]) -> bool:
+    def is_sized(self, sizes: Sizes) -> bool:
         """Return whether all sizes of the prior are known."""
         names = [name for _, name, _ in FACTOR.findall(self.size)]
         return all(name in sizes or name[0].isdigit() for name in names)
@@ -130,7 +120,7 @@ def rows_of(table: Path) -> tuple[Row, ...]:
     return tuple(Row(**dict(zip(columns, row, strict=True))) for row in rows)
 
 
-def prior_of(kind: str, formulas: str, sizes: Mapping[str, Any]) -> Distribution:
+def prior_of(kind: str, formulas: str, sizes: Sizes) -> Distribution:
     """Return a prior, of as many numbers as its formulas have.
 
     Args:
@@ -150,7 +140,7 @@ def prior_of(kind: str, formulas: str, sizes: Mapping[str, Any]) -> Distribution
     return Independent(one, 1, validate_args=False)
 
 
-def _number(formula: str, sizes: Mapping[str, Any]) -> Tensor:
+def _number(formula: str, sizes: Sizes) -> Tensor:
     """Return the value of a product, as in "0.1 position / load^2", shape (k,)."""
     value = 1.0
     for slash, name, power in FACTOR.findall(formula):

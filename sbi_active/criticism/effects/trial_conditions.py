@@ -8,13 +8,12 @@ import torch
 from torch import Tensor
 
 from sbi_active.actions import ActionSpace, DiscreteActions
-from sbi_active.criticism.data.arrays import rows_at
 from sbi_active.criticism.data.input_series import held_at
 from sbi_active.criticism.data.trials import Trials
 from sbi_active.criticism.effects.effect import Context
 from sbi_active.expected import require
 from sbi_active.simulation import SimulatorModel
-from sbi_active.simulation.conditions import typed
+from sbi_active.simulation.conditions import at_rows, typed
 
 
 def conditions_of_trials(
@@ -31,13 +30,8 @@ def conditions_of_trials(
     times = None if has_own_times(model, trials) else trials.sample_times
     if times is not None and times.ndim == 2:
         times = _held(times)[rows]
-    return Context(
-        index=trials.index[rows],
-        times=times,
-        inputs=rows_at(trials.inputs, rows),
-        input_times=trials.input_times,
-        start=rows_at(trials.start, rows),
-    )
+    own = {name: getattr(trials, name) for name in ("index", "inputs", "start")}
+    return Context(times=times, input_times=trials.input_times, **at_rows(own, rows))
 
 
 def conditions_for(
@@ -86,9 +80,8 @@ def with_known_inputs(
         return actions
     recorded = trials.action.unique(dim=0)
     kept = recorded[actions.contains(recorded.float())]
-    return DiscreteActions(
-        kept if len(kept) else recorded, names=actions.names, units=actions.units
-    )
+    kept = kept if len(kept) else recorded
+    return DiscreteActions(kept, names=actions.names, units=actions.units)
 
 
 def are_known(model: SimulatorModel, trials: Trials, action: Tensor) -> Tensor:
@@ -117,7 +110,7 @@ def unmeasured(
     """
     same = _same(trials, action)
     found, first = same.any(1), same.int().argmax(1)
-    inputs = rows_at(trials.inputs, first)
+    inputs = trials.inputs and at_rows(trials.inputs, first)
     if inputs is not None and model.inputs is not None:
         assert trials.input_times is not None
         signals = model.inputs.inputs(action.double())

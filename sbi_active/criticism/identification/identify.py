@@ -140,7 +140,8 @@ def identify(
     least = float(parts.p_value.min(initial=1.0))
     disagree = least * len(parts.p_value) < own.level
     if disagree:
-        u = reflected(parts.widen(u, own.wider, rng), low, high)
+        weight = own.wider * rng.standard_normal((len(u), len(parts.deviation)))
+        u = reflected(u + weight @ parts.deviation, low, high)
     ratio, alike = shared(found)
     if alike < own.level:
         extra = rng.permutation(found.draws.u[:, : u.shape[1]])
@@ -276,15 +277,11 @@ def _beyond(
 
 def _at_bounds(belief: IdentifiedBelief) -> list[str]:
     """Return the parameters that may be beyond a bound of the prior."""
-    each = zip(belief.interval().items(), belief.sides, strict=True)
+    limits = {-1: "lower one: at most {1:.3g}", 1: "upper one: at least {0:.3g}"}
+    each = zip(belief.interval().items(), belief.sides.tolist(), strict=True)
     return [
-        f"SA103 {name} is at a bound of its prior, the "
-        + (
-            f"lower one: at most {high:.3g}"
-            if side < 0
-            else f"upper one: at least {low:.3g}"
-        )
-        + ", and nothing says how far beyond; move the bound, or say why"
-        for (name, (low, high)), side in each
+        f"SA103 {name} is at a bound of its prior, the {limits[side].format(*ends)}, "
+        "and nothing says how far beyond; move the bound, or say why"
+        for (name, ends), side in each
         if side
     ]

@@ -35,7 +35,7 @@ BAD_TRIALS = [
         ({"names": names}, "expected names of 2 trials, each another")
         for names in ("ab", ["a"], ["a", "a"], ["a", " "])
     ),
-    ({"x": [1.0]}, "expected actions .* with as many rows"),
+    ({"x": [1.0]}, "expected finite actions .* with as many rows"),
     ({"x": [NAN, NAN]}, "expected at least one valid trial"),
     ({"x": [1.0, NAN], "role": ROLE}, "in the held-out trials; got NaN in trial 1"),
     ({"sample_times": [1.0]}, r"expected sample_times of shape \(2,\)"),
