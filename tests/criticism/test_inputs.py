@@ -105,6 +105,27 @@ def test_a_simulator_may_require_times(by_model):
     assert report.verdict == "bias"
 
 
+def test_inputs_have_to_cover_the_times_of_a_model():
+    def follow(theta, action, *, inputs):
+        return theta * inputs["u"][:, :5]
+
+    times = torch.linspace(0, 1, 5)
+    model = SimulatorModel(follow, noise=0.1, sample_times=times)
+    prior = BoxUniform(torch.zeros(1), torch.ones(1))
+    for begin, message in (
+        (0.0, None),
+        (50.0, "x of trial 0 measured within .* 50 to"),
+    ):
+        grid = begin + torch.linspace(0, 2, 11)
+        inputs = {"u": torch.ones(3, 11)}
+        trials = Trials(None, torch.zeros(3, 5), inputs=inputs, input_times=grid)
+        if message is None:
+            Criticism(model, prior, trials)
+            continue
+        with pytest.raises(ValueError, match=message):
+            Criticism(model, prior, trials)
+
+
 # Generic effects of recordings: which there are, and that a loop finds them
 
 

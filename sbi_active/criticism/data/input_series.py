@@ -61,15 +61,18 @@ def inputs_of(
     if inputs is None:
         require(times is None, "inputs", "input_times alone", "pass inputs=")
         return None, None
-    is_named = isinstance(inputs, Mapping) and len(inputs) > 0
-    require(is_named, "inputs as {name: series}", type(inputs), "name each input")
+    names_of = [*inputs] if isinstance(inputs, Mapping) else []
+    is_named = bool(names_of) and all(isinstance(name, str) for name in names_of)
+    got = names_of or type(inputs)
+    require(is_named, "inputs as {name: series}", got, "name each input")
     known = "input_hold 'previous' or 'linear'"
     require(hold in get_args(Hold), known, repr(hold), "choose one")
     of = times if isinstance(times, Mapping) else dict.fromkeys(inputs, times)
     expected, got = f"input_times of {', '.join(inputs)}", f"those of {', '.join(of)}"
     advice = "give each input its own, or one array for all"
     require({*of} == {*inputs}, expected, got, advice)
-    series, stamps, num = {}, {}, len(names)
+    pieces: dict[str, list[Piece]] = {}
+    stamps, num = dict[str, Tensor](), len(names)
     for name, value in inputs.items():
         own = padded(value)
         own = own.expand(num, -1) if own.ndim == 1 and len(own) > 1 else own
@@ -87,14 +90,11 @@ def inputs_of(
         advice = "pass them, in seconds from the origin of sample_times"
         is_each = when is not None and when.shape in (own.shape[1:], own.shape)
         require(is_each, expected, got, advice)
-        series[name], stamps[name] = own, torch.as_tensor(when).expand(shape)
-    pieces = {
-        name: [
+        stamps[name] = torch.as_tensor(when).expand(shape)
+        pieces[name] = [
             _piece(f"input {name!r} of trial {trial}", u, t)
-            for trial, u, t in zip(names, value, stamps[name], strict=True)
+            for trial, u, t in zip(names, own, stamps[name], strict=True)
         ]
-        for name, value in series.items()
-    }
     grid = _grid(pieces, names)
     found = {
         name: torch.from_numpy(np.stack([_at(grid, *piece, hold) for piece in each]))
@@ -193,10 +193,8 @@ def _grid(pieces: Mapping[str, Sequence[Piece]], names: Sequence[str]) -> Array:
     if same and (np.abs(steps - steps.mean()) <= SAME * steps.mean()).all():
         return first.copy()
     step = min(float(np.median(np.diff(t))) for t, _ in every)
-    begin, end = (
-        np.array([[t[k] for t, _ in each] for each in pieces.values()]) for k in (0, -1)
-    )
-    begin, end = begin.min(0), end.max(0)  # of each trial
+    begin = np.min([[t[0] for t, _ in each] for each in pieces.values()], axis=0)
+    end = np.max([[t[-1] for t, _ in each] for each in pieces.values()], axis=0)
     low, high = begin.min(), end.max()
     # Pieces of one record have its clock, and a simulator would run up to each.
     after, span = begin - low, end - begin

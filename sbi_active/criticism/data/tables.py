@@ -300,7 +300,7 @@ def arguments_of(table: Table, beside: Table | None = None) -> dict[str, Any]:
     for column in table.of("repeat_of"):
         told, first = table.frame[column], table.constant(column)
         is_known = told.isna() | (told < 0) | told.isin(index)
-        advice, expected = "give that of the first one", "an index of the table"
+        advice, expected = "give that of the first trial", "an index of the table"
         table.require(is_known, column, expected, advice, told)
         place = {value: i for i, value in enumerate(index)}
         found["repeat_of"] = [place.get(value, -1) for value in first]

@@ -213,7 +213,8 @@ class Trials:
                 as ms, mm and deg; what is not known, such as px, stays as it is.
             order: Order of execution; "unknown" where rows are in any order.
             inputs: Another file, or a data frame, with the inputs at times of their
-                own: "time", "input_\*", and "trial" unless all trials share them.
+                own: "time", "input_\*", and "trial" unless all trials share them. Names
+                in columns and units hold in either table.
             input_hold: Value of an input between two times, as in the constructor.
 
         Raises:

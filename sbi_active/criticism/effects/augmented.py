@@ -59,7 +59,7 @@ class AugmentedSimulator(SimulatorModel):
 
     Called as any simulator, with (theta, phi) and an action, the rows are those of the
     *next* trial, whose index is ``next_index``: an effect that grows with the index
-    goes on from there. :meth:`evaluate` takes an index a row.
+    goes on from there. :meth:`evaluate` takes a context, with an index a row.
 
     Args:
         model: The simulator; an augmented one is extended.
