@@ -130,12 +130,9 @@ def _made(
     found = []
     for row in rows_of(TABLE):
         if row.of == of and row.is_sized(sizes):
-            how: dict[str, Any] = {
-                "hook": hook,
-                "apply": Wrapped(row.changes, **wrapped),
-            }
-            how["needs_order"] = row.changes == "drift by trial"
-            found.append(row.made(label, sizes, words, **how))
+            how: Any = {"needs_order": row.changes == "drift by trial"}
+            how["apply"] = Wrapped(row.changes, **wrapped)
+            found.append(row.made(label, sizes, words, hook=hook, **how))
     return found
 
 

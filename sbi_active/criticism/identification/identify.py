@@ -206,12 +206,9 @@ def _with_noise(
     noise = model.noise
     num = int(np.prod(trials.x.shape[2:]))
     if noise is None:
-        expected, is_mean = (
-            "a deterministic simulator",
-            lacks_noise(model, prior, trials),
-        )
+        is_mean = lacks_noise(model, prior, trials)
         advice = "use Campaign, which learns what it returns, or declare noise="
-        require(is_mean, expected, "a random one", advice)
+        require(is_mean, "a deterministic simulator", "a random one", advice)
         model = copy.copy(model)
         model.noise = GaussianNoise(1.0)
         return model, None
