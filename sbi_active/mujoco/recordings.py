@@ -152,7 +152,7 @@ def _columns(
     require_named([TIME, *sensors, *driven], headers, "the recordings")
     units = {TIME: "s", **{channel.name: channel.unit for channel in channels}}
     found = []
-    for column in find_columns(headers, columns=told, source="the recordings"):
+    for column in find_columns(headers, told, None, "the recordings"):
         name, unit = split(column.header)
         expected = units.get(name, "")
         require(

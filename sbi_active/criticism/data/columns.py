@@ -83,6 +83,7 @@ KEYS = (TRIAL, TIME, *SEVERAL, *OPTIONAL)
 
 #: Names of columns by what they are, where they have names of their own.
 Told = Mapping[str, str | Sequence[str]]
+Units = Mapping[str, str]  # by column
 
 
 @dataclass(frozen=True)
@@ -110,11 +111,7 @@ class Column:
 
 
 def find_columns(
-    headers: Sequence[str],
-    *,
-    columns: Told | None = None,
-    units: Mapping[str, str] | None = None,
-    source: str = "the table",
+    headers: Sequence[str], columns: Told | None, units: Units | None, source: str
 ) -> list[Column]:
     """Return the columns of a table, by their names or as the user says.
 
@@ -211,7 +208,7 @@ def _role_of(name: str) -> str:
     return name if name in KEYS else ""
 
 
-def _column(role: str, header: str, units: Mapping[str, str], source: str) -> Column:
+def _column(role: str, header: str, units: Units, source: str) -> Column:
     name, unit = split(header)
     given = units.get(header, units.get(name, ""))
     got = f"[{unit}] in the header of {source} and {given} in units"

@@ -22,6 +22,7 @@ from sbi_active.criticism.data.columns import (
     TRIAL,
     Column,
     Told,
+    Units,
     find_columns,
     pairs,
     require_columns,
@@ -178,11 +179,7 @@ def _words(cells: Any) -> Any:
 
 
 def read_trials(
-    table: Source,
-    *,
-    columns: Told | None = None,
-    units: Mapping[str, str] | None = None,
-    inputs: Source | None = None,
+    table: Source, columns: Told | None, units: Units | None, inputs: Source | None
 ) -> dict[str, Any]:
     """Return the arguments of ``Trials`` that a CSV file, folder or data frame holds.
 
@@ -228,7 +225,7 @@ def read_trials(
 
 
 def _read(
-    table: Any, columns: Told | None, units: Mapping[str, str] | None, name: str
+    table: Any, columns: Told | None, units: Units | None, name: str
 ) -> tuple[Table, list[str]]:
     """Return a table, and the names of all its columns; ``name`` is a data frame's."""
     parts, source, by_file = {name: table}, name, False
@@ -238,7 +235,7 @@ def _read(
         parts = {str(path): read_csv(path) for path in paths}
         by_file = path.is_dir() and paths[0].name != TABLE
     parts, headers = headed(parts)
-    found = find_columns(headers, columns=columns, units=units, source=source)
+    found = find_columns(headers, columns, units, source)
     by_file = by_file and any(column.role == TIME for column in found)
     return Table(parts, found, source, by_file=by_file), headers
 

@@ -220,7 +220,7 @@ class Trials:
         Raises:
             ValueError: If the table is not understood; the text says where.
         """
-        found = read_trials(path, columns=columns, units=units, inputs=inputs)
+        found = read_trials(path, columns, units, inputs)
         return cls(**found, order=order, input_hold=input_hold)
 
     @classmethod
