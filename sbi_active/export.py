@@ -12,6 +12,7 @@ from torch import Tensor
 from torch.distributions import Distribution
 
 from sbi_active.arviz_versions import Groups, data_tree, inference_data
+from sbi_active.criticism.effects.effect import Context
 from sbi_active.expected import suggests
 from sbi_active.inference.beliefs.belief import names_of
 from sbi_active.seeding import derive_seed, draws_of, forked_generators
@@ -325,7 +326,7 @@ def _rival_log_likelihood(report: Any, found: Any, draws: np.ndarray) -> Any:
         given = theta[:, :own], action[k].expand(len(theta), -1)
         if effects:
             place = torch.full((len(theta),), float(report.residuals.index[k]))
-            mean = simulator.evaluate(given[0], phi, given[1], index=place)
+            mean = simulator.evaluate(given[0], phi, given[1], context=Context(place))
         else:
             mean = simulator.mean(*given)
         terms.append(noise.log_prob(x[k].expand(mean.shape), mean.double()))

@@ -9,7 +9,6 @@ from sbi_active.actions import DiscreteActions
 from sbi_active.arrays import distance_from, measured, own_tensor
 from sbi_active.campaign import Campaign
 from sbi_active.criticism import Trials
-from sbi_active.criticism.data.tables import read_trials
 from sbi_active.criticism.misfit.rule import Rule
 from sbi_active.design import InformationGainDesigner
 from sbi_active.mujoco import from_mjcf
@@ -89,9 +88,7 @@ def test_a_mistyped_keyword_is_told_with_the_one_that_was_meant(call, wrong, mea
 # Warnings point at the user's line, from however deep
 
 
-@pytest.mark.parametrize(
-    "read", [Trials.from_csv, read_trials, lambda path: read_trials(path)]
-)
+@pytest.mark.parametrize("read", [Trials.from_csv, lambda path: Trials.from_csv(path)])
 def test_a_warning_points_at_who_read_it(read, tmp_path):
     file = tmp_path / "trials.csv"
     file.write_text("action_speed,x_place\n1,0.1\n2,\n")

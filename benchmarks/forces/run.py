@@ -42,7 +42,8 @@ from sbi_active.criticism import (
     Trials,
     generic_effects,
 )
-from sbi_active.criticism.data.arrays import Role
+from sbi_active.criticism.data import Role
+from sbi_active.criticism.effects.effect import Context
 from sbi_active.criticism.forces import force_effects
 from sbi_active.criticism.forces.dictionary import FORMS
 from sbi_active.criticism.results import Tracing
@@ -226,10 +227,9 @@ def _held_out(
     draws = torch.from_numpy(loop.trace().evidences[key].draws)[:NUM_DRAWS]
     num = len(draws)
     theta, phi = model.split(draws.repeat_interleave(len(action), 0))
-    index = torch.tensor(HELD_OUT).double().repeat(num)
-    x = model.evaluate(theta, phi, action.repeat(num, 1), index=index).double()
-    mean = x.reshape(num, *clean.shape).mean(0)
-    scaled = (mean - clean) / torch.as_tensor(own.sd)
+    context = Context(torch.tensor(HELD_OUT).double().repeat(num))
+    x = model.evaluate(theta, phi, action.repeat(num, 1), context=context).double()
+    scaled = (x.reshape(num, *clean.shape).mean(0) - clean) / torch.as_tensor(own.sd)
     return float((scaled**2).mean().sqrt())
 
 

@@ -42,15 +42,26 @@ def main(argv: Sequence[str] | None = None) -> int:
         return shell_complete(cli.program, {}, cli.NAME, variable, shell)
     is_json = "--json" in words
     logging.getLogger("sbi_active").setLevel(logging.INFO)
-    logging.getLogger("sbi_active").handlers = [cli.Progress()]
+    progress = logging.StreamHandler()  # what takes long is said on standard error
+    progress.setFormatter(logging.Formatter("sbi-active: %(message)s"))
+    logging.getLogger("sbi_active").handlers = [progress]
     with contextlib.suppress(AttributeError, ValueError):
         # A terminal that has no such letter shows its number.
         sys.stdout.reconfigure(errors="backslashreplace")  # type: ignore
+    # The answer for programs has standard output for itself.
+    apart = cli.output_to_errors() if is_json else contextlib.nullcontext()
     try:
-        answer = _answer(words, is_json)
+        # Words are UTF-8, whatever the locale.
+        words = [word.encode(errors="surrogateescape").decode() for word in words]
+        with apart, warnings.catch_warnings():
+            warnings.showwarning = lambda message, *_: cli.say(f"note: {message}")
+            with cli.program.make_context(cli.NAME, words) as context:
+                answer = cli.program.invoke(context) or cli.Answer({}, "")
         if answer.text:
             print(cli.as_line(answer.data) if is_json else answer.text, flush=True)
         return answer.status
+    except Exit as ended:  # of help and version
+        return ended.exit_code
     except (Exception, KeyboardInterrupt) as raised:
         error = cli.failure(raised)
     if error["type"] != "BrokenPipeError":  # as in "| head": nobody reads on
@@ -61,17 +72,3 @@ def main(argv: Sequence[str] | None = None) -> int:
     except OSError:  # the end of the process has then nothing to complain of
         os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
     return error["status"]
-
-
-def _answer(words: list[str], is_json: bool) -> cli.Answer:
-    """Run a command; the answer for programs has standard output for itself."""
-    # Words are UTF-8, whatever the locale.
-    words = [word.encode(errors="surrogateescape").decode() for word in words]
-    apart = cli.output_to_errors() if is_json else contextlib.nullcontext()
-    with apart, warnings.catch_warnings():
-        warnings.showwarning = lambda message, *_: cli.say(f"note: {message}")
-        try:
-            with cli.program.make_context(cli.NAME, words) as context:
-                return cli.program.invoke(context) or cli.Answer({}, "")
-        except Exit as ended:  # of help and version
-            return cli.Answer({}, "", ended.exit_code)

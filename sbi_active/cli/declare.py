@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import ctypes
 import json
-import logging
 import math
 import os
 import re
@@ -129,14 +128,6 @@ def say(said: object) -> None:
     click.echo(f"sbi-active: {said}", err=True)
 
 
-class Progress(logging.Handler):
-    """Says on standard error what takes long."""
-
-    def emit(self, record: logging.LogRecord) -> None:
-        """Print a line of the library's log."""
-        say(record.getMessage())
-
-
 def failure(error: BaseException) -> dict[str, Any]:
     """Return an error for programs: its class, its text, and the exit status."""
     status, text = FAILED, located(error)
@@ -215,10 +206,9 @@ def number_of(text: str, *, is_outcome: bool = False) -> float:
     Raises:
         ValueError: If it is anything else.
     """
-    try:
-        value = math.inf if "_" in text else float(text)
-    except ValueError:
-        value = math.inf
+    value = math.inf
+    with contextlib.suppress(ValueError):
+        value = float(text.replace("_", "?"))
     is_held = value == 0 or 2.0**-126 <= abs(value) <= 2.0**128 - 2.0**104
     advice = "write them apart by blanks, with a point as in 1.5 or 2e-3, no unit"
     is_right = is_held or is_outcome and math.isnan(value)

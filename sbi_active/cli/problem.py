@@ -53,8 +53,8 @@ def load_module(place: str, here: str | None = None) -> tuple[Any, str]:
     require(bool(name), expected, repr(place), "add its name behind a colon")
     file = Path(module).resolve() if module.endswith(".py") else None
     require(file is None or file.is_file(), "a file", f"none at {file}", "check it")
+    here = here or os.getcwd()  # before what is installed
     module, folder = (file.stem, str(file.parent)) if file else (module, here)
-    folder = folder or os.getcwd()  # before what is installed
     sys.path[:] = [folder, *(p for p in sys.path if p != folder)]
     try:
         loaded = importlib.import_module(module)
@@ -233,7 +233,10 @@ def open_campaign(
         reader = Campaign.load(folder)
         if not simulates:
             return reader
-    known = {"simulator": simulator, "noise": noise} if simulator else _named(folder)
+    known = {"simulator": simulator, "noise": noise}
+    if not simulator:  # as whoever made the campaign here named it
+        with suppress(OSError, ValueError):
+            known = json.loads(_path_of(folder).read_text())
     model, prior, actions, effects = problem_of(known, needs=())
     own: Any = {} if reader else {"prior": prior, "actions": actions}
     reader = reader or Campaign.load(folder, **own)
@@ -253,12 +256,6 @@ def remember(folder: Path, /, **options: Any) -> None:
     with suppress(OSError):  # as in a home that is read only: --simulator each time
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(json.dumps({"folder": os.getcwd(), **options}))
-
-
-def _named(folder: Path) -> dict[str, Any]:
-    with suppress(OSError, ValueError):
-        return json.loads(_path_of(folder).read_text())
-    return {}
 
 
 def _path_of(folder: Path) -> Path:

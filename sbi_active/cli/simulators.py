@@ -66,14 +66,13 @@ def gate(**given: Any) -> cli.Answer:
 def _criticized(campaign: Any, out: Path | None) -> cli.Answer:
     from sbi_active.cli.problem import library_of
 
-    data, text, _ = _answer(campaign.criticize(library_of(campaign)), out)
-    text += f"\n\nto go on with what it names: sbi-active adopt {campaign.directory}"
-    return cli.Answer(data, text)
+    then = f"\n\nto go on with what it names: sbi-active adopt {campaign.directory}"
+    return _answer(campaign.criticize(library_of(campaign)), out, then)
 
 
-def _answer(report: Any, out: Path | None) -> cli.Answer:
+def _answer(report: Any, out: Path | None, then: str = "") -> cli.Answer:
     saved = "" if out is None else f"\n\nsaved: {report.save(out)}"
-    return cli.Answer(report.to_dict(), f"{report}{saved}")
+    return cli.Answer(report.to_dict(), f"{report}{saved}{then}")
 
 
 def _compared(path: Path, given: dict[str, Any]) -> cli.Answer:

@@ -151,8 +151,8 @@ def require_fitting(
         times, grid = model.sample_times, trials.input_times
         assert times is not None
         assert grid is not None
-        stamps = dict.fromkeys(trials.inputs, grid[None])
-        require_covered(times[None], stamps, trials.names)
+        stamps = dict.fromkeys(trials.inputs, grid.expand(len(trials), -1))
+        require_covered(times.expand(len(trials), -1), stamps, trials.names)
     if actions is not None:
         _warn_outside(trials, actions)
     theta, action, at = _some_rows(prior, trials)

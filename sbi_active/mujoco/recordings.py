@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -12,20 +11,17 @@ import numpy as np
 import pandas as pd
 
 from sbi_active.arrays import Array
-from sbi_active.criticism.data.cells import Cells, read_csv
 from sbi_active.criticism.data.columns import (
     TIME,
     TRIAL,
     Column,
     find_columns,
+    require_named,
     split,
     to_si,
 )
-from sbi_active.criticism.data.tables import (
-    arguments_of,
-    find_recordings,
-    headers_of,
-)
+from sbi_active.criticism.data.files import find_recordings, read_csv
+from sbi_active.criticism.data.tables import Table, arguments_of, headed
 from sbi_active.criticism.data.trials import Trials
 from sbi_active.expected import require
 from sbi_active.messages import warn
@@ -86,22 +82,21 @@ def trials_of(
     parts = {}
     for k, log in enumerate(logs):
         is_file = isinstance(log, str | Path)
-        what = f"recording {k} ({log})" if is_file else f"recording {k}"
         frame = read_csv(Path(log)) if is_file else pd.DataFrame(log)
-        require(len(frame) > 0, f"samples in {what}", "no rows", "record some")
-        header = [str(name).strip() for name in frame]
-        parts[what] = frame.set_axis(header, axis=1).assign(**{TRIAL: str(k)})
-    columns = _columns(model, headers_of(parts), channels, inputs)
-    cells = Cells(parts, columns, "the recordings")
-    found, step = arguments_of(cells), float(model.opt.timestep)
-    numbers = [cells.numbers(column, empty=True) for column in columns["x"]]
-    for what, at in zip(parts, cells.members, strict=True):
-        require_seconds(cells.time[at], step, what)
-        _note_spacing(cells.time[at], step, what)
-        for channel, values in zip(channels, numbers, strict=True):
-            _note_angles(model, channel, values[at], what)
-    for column in columns["input"]:
-        values = cells.numbers(column, empty=True)
+        name = f"recording {k} ({log})" if is_file else f"recording {k}"
+        parts[name] = frame.assign(**{TRIAL: str(k)})
+    parts, headers = headed(parts)
+    columns = _columns(model, headers, channels, inputs)
+    table = Table(parts, columns, "the recordings")
+    found, step = arguments_of(table), float(model.opt.timestep)
+    for what, rows in table.frame.groupby(level="file", sort=False):
+        time = rows[TIME].to_numpy()
+        require_seconds(time, step, str(what))
+        _note_spacing(time, step, str(what))
+        for channel, column in zip(channels, table.of("x"), strict=True):
+            _note_angles(model, channel, rows[column].to_numpy(), str(what))
+    for column in table.of("input"):
+        values = table.frame[column].to_numpy()
         require_in_range(model, column.name, values, "the recordings")
     times = found.pop("sample_times")
     same = all(np.array_equal(each, times[0]) for each in times)
@@ -138,44 +133,37 @@ def _columns(
     headers: Sequence[str],
     channels: Sequence[Channel],
     inputs: Sequence[str],
-) -> dict[str, list[Column]]:
-    """Return the columns of logs that a model takes."""
-    units = {TIME: "s", **{channel.name: channel.unit for channel in channels}}
-    names, own = [channel.name for channel in channels], [split(c)[0] for c in headers]
-    starts = [START + name for name in places_of(model)]
-    for name in own:
-        if name.startswith(START):
-            require_name(name, starts, "start state")
+) -> list[Column]:
+    """Return the columns of logs that a model takes, called as it calls them."""
+    sensors, own = (
+        [channel.name for channel in channels],
+        [split(c)[0] for c in headers],
+    )
+    places = {START + name: name for name in places_of(model)}
+    starts = [name for name in own if name.startswith(START)]
+    for name in starts:
+        require_name(name, places, "start state")
     # A column that an input shares with a sensor is the sensor's.
-    controls = {name: f"{name} control" for name in inputs}
-    is_other = {name: name in names or controls[name] in own for name in inputs}
-    columns = {
-        TRIAL: TRIAL,
-        TIME: TIME,
-        "x": names,
-        "input": [controls[name] if is_other[name] else name for name in inputs],
-        "start": [name for name in starts if name in own],
+    driven = {
+        f"{name} control" if name in sensors or f"{name} control" in own else name: name
+        for name in inputs
     }
-    found = find_columns(headers, columns=columns, source="the recordings")
-    for column in chain(*found.values()):
-        name, told = split(column.header)
+    told = {TRIAL: TRIAL, TIME: TIME, "x": sensors, "input": [*driven], "start": starts}
+    require_named([TIME, *sensors, *driven], headers, "the recordings")
+    units = {TIME: "s", **{channel.name: channel.unit for channel in channels}}
+    found = []
+    for column in find_columns(headers, told, None, "the recordings"):
+        name, unit = split(column.header)
         expected = units.get(name, "")
-        is_known = not told or (to_si(told) and expected in ("", column.unit))
         require(
-            bool(is_known),
+            not unit or bool(to_si(unit) and expected in ("", column.unit)),
             f"{name!r} in {expected or 'a unit of SI'}",
-            f"[{told}] in the recordings",
+            f"[{unit}] in the recordings",
             "convert the numbers, or leave their unit out",
         )
-    # From here on they are called as the model's own.
-    each = zip(found["x"], channels, strict=True)
-    called = zip(found["input"], inputs, strict=True)
-    starting = ((c, c.name.removeprefix(START)) for c in found["start"])
-    return found | {
-        "x": [replace(c, name=own.name, unit=own.unit) for c, own in each],
-        "input": [replace(c, name=name) for c, name in called],
-        "start": [replace(c, name=name) for c, name in starting],
-    }
+        name = {**places, **driven}.get(name, name)
+        found.append(replace(column, name=name, unit=column.unit or expected))
+    return found
 
 
 def require_seconds(time: Array, step: float, what: str) -> None:

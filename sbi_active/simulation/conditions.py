@@ -2,7 +2,7 @@
 
 A function ``fn(theta, action)`` may take any of ``times``, shape (n, k), at which x is
 measured; ``inputs``, {name: (n, m)}, over time; ``input_times``, (m,), their uniform
-grid; and ``start``, the measured start states, (n, d) or {name: (n,)}.
+grid; and ``start``, the measured start states, {name: (n,)}.
 """
 
 from __future__ import annotations

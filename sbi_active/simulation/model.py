@@ -50,7 +50,7 @@ class SimulatorModel(Shown):
     a number, or one a row, shape (n, ...). Four names say how a trial was run instead:
     ``times``, shape (n, k), at which x is measured; ``inputs`` over time, {name:
     (n, m)}, with their uniform grid ``input_times``, shape (m,); and ``start``,
-    measured start states, (n, d) or {name: (n,)}. Trials hand them over, and the model
+    measured start states, {name: (n,)}. Trials hand them over, and the model
     its ``sample_times``.
 
     Args:

@@ -61,8 +61,9 @@ def test_a_function_of_one_row_gets_its_own_inputs():
     shapes = []
 
     def one(theta, action, rng, *, inputs, times, input_times, start):
-        shapes.append((inputs["u"].shape, times.shape, input_times.shape, start.shape))
-        return theta * inputs["u"].sum() + start[0]
+        each = inputs["u"], times, input_times, start["q"]
+        shapes.append(tuple(part.shape for part in each))
+        return theta * inputs["u"].sum() + start["q"]
 
     model = SimulatorModel(one, noise=0.1, batched=False)
     trials = Trials(
@@ -71,12 +72,12 @@ def test_a_function_of_one_row_gets_its_own_inputs():
         sample_times=[0.5],
         inputs={"u": torch.tensor([[1.0, 2.0, 0.0], [3.0, 4.0, 0.0]])},
         input_times=[0.0, 0.5, 1.0],
-        start=torch.tensor([[1.0, 0.0], [2.0, 0.0]]),
+        start={"q": [1.0, 2.0]},
     )
     simulator = TrialSimulator(AugmentedSimulator(model, []), trials)
     mean, _, _ = simulator.predict(torch.ones(1, 1), {})
     assert mean.tolist() == [[4.0, 9.0]]
-    assert {*shapes} == {((3,), (1,), (3,), (2,))}
+    assert {*shapes} == {((3,), (1,), (3,), ())}
 
 
 def falling(theta, action, *, times):  # which cannot do without them
@@ -102,6 +103,27 @@ def test_a_simulator_may_require_times(by_model):
     given = {"effects": effects, "evaluate": False, "plan": False}
     report = close_loop(model, prior, trials, **given)
     assert report.verdict == "bias"
+
+
+def test_inputs_have_to_cover_the_times_of_a_model():
+    def follow(theta, action, *, inputs):
+        return theta * inputs["u"][:, :5]
+
+    times = torch.linspace(0, 1, 5)
+    model = SimulatorModel(follow, noise=0.1, sample_times=times)
+    prior = BoxUniform(torch.zeros(1), torch.ones(1))
+    for begin, message in (
+        (0.0, None),
+        (50.0, "x of trial 0 measured within .* 50 to"),
+    ):
+        grid = begin + torch.linspace(0, 2, 11)
+        inputs = {"u": torch.ones(3, 11)}
+        trials = Trials(None, torch.zeros(3, 5), inputs=inputs, input_times=grid)
+        if message is None:
+            Criticism(model, prior, trials)
+            continue
+        with pytest.raises(ValueError, match=message):
+            Criticism(model, prior, trials)
 
 
 # Generic effects of recordings: which there are, and that a loop finds them

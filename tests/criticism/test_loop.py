@@ -7,6 +7,7 @@ from sbi.utils import BoxUniform
 from sbi_active import DiscreteActions, SimulatorModel
 from sbi_active.criticism import (
     AugmentedSimulator,
+    Context,
     Criticism,
     Effect,
     Trials,
@@ -60,7 +61,7 @@ def measured(seed, phi, *, num=10, held_out=0):
     real = AugmentedSimulator(MODEL, LIBRARY)
     phi = {k: torch.full((total, 1), v) for k, v in phi.items()}
     index = torch.arange(float(total))
-    x = real.evaluate(theta, phi, action, index=index)
+    x = real.evaluate(theta, phi, action, context=Context(index))
     x = x + NOISE * torch.randn(x.shape, generator=gen)
     role = ["fit"] * num + ["held out"] * held_out
     return Trials(action, x, role=role)

@@ -7,7 +7,10 @@ from typing import Any, Literal
 
 import numpy as np
 import torch
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 from torch import Tensor
+from torch.nn.utils.rnn import pad_sequence
 
 from sbi_active.arrays import measured
 from sbi_active.expected import require
@@ -18,7 +21,8 @@ Role = Literal["fit", "held out"]
 
 def padded(value: Any) -> Tensor:
     """Return copies of arrays stacked, shorter ones padded with NaN at their end."""
-    if _is_stacked(value):
+    is_array = isinstance(value, Tensor | np.ndarray) and value.dtype != object
+    if is_array or np.isscalar(value):
         return measured(value)
     rows = [measured(np.nan if row is None else row) for row in value]
     if len({row.shape for row in rows}) <= 1:
@@ -29,17 +33,7 @@ def padded(value: Any) -> Tensor:
         f"shapes {[tuple(row.shape) for row in rows]}",
         "give the same channels in each",
     )
-    longest = max(len(row) for row in rows)
-    x = torch.full((len(rows), longest, *rows[0].shape[1:]), torch.nan).double()
-    for i, row in enumerate(rows):
-        x[i, : len(row)] = row
-    return x
-
-
-def _is_stacked(value: Any) -> bool:
-    if isinstance(value, np.ndarray) and value.dtype == object:
-        return all(np.ndim(row) == 0 for row in value.flat)
-    return isinstance(value, Tensor | np.ndarray) or bool(np.isscalar(value))
+    return pad_sequence(rows, batch_first=True, padding_value=torch.nan)
 
 
 def kept(mask: Any, x: Tensor) -> Tensor:
@@ -52,12 +46,10 @@ def kept(mask: Any, x: Tensor) -> Tensor:
     keep = padded(mask)
     if keep.ndim == 1 and x.shape[1:] == (1,):
         keep = keep[:, None]
-    expected, got = f"a mask of shape {tuple(x.shape)}, that of x", tuple(keep.shape)
-    require(keep.shape == x.shape, expected, got, "give one an entry of x")
-    others = keep[(keep != 0) & (keep != 1) & ~keep.isnan()].tolist()
-    got = ", ".join(f"{value:g}" for value in others[:1])
-    advice = "pass True where x is a measurement"
-    require(not others, "a mask of True and False, or 1 and 0", got, advice)
+    is_mask = bool(((keep == 0) | (keep == 1) | keep.isnan()).all())
+    expected = f"a mask of True and False of shape {tuple(x.shape)}, that of x"
+    got = f"{keep.flatten().tolist()[:6]} of shape {tuple(keep.shape)}"
+    require(is_mask and keep.shape == x.shape, expected, got, "pass True where it is")
     return keep == 1
 
 
@@ -71,6 +63,23 @@ def without_inf(x: Tensor, names: Sequence[str]) -> Tensor:
             "measured, as NaN is",
         )
     return x.where(x.isfinite(), torch.nan)
+
+
+def one_each(name: str, value: Any, num: int, advice: str = "correct it") -> Tensor:
+    """Return a finite number for each of some trials, shape (num,).
+
+    Args:
+        name: Name of the numbers.
+        value: Numbers as given.
+        num: Number of trials.
+        advice: Advice on what to do where one is missing.
+    """
+    tensor = measured(value, name=name)
+    expected, shape = f"{name} of shape ({num},), one a trial", tuple(tensor.shape)
+    require(shape == (num,), expected, shape, "give one each")
+    lost = (~tensor.isfinite()).nonzero()[:, 0].tolist()
+    require(not lost, f"finite numbers in {name}", f"others in trials {lost}", advice)
+    return tensor
 
 
 def repeated(action: Tensor) -> Tensor:
@@ -91,63 +100,44 @@ def root(repeat_of: Tensor) -> Tensor:
         Positions that repeat nothing themselves, -1 for none.
 
     Raises:
-        ValueError: If a position is no trial, or trials repeat each other in a circle.
+        ValueError: If a position is no trial.
 
     Example:
         >>> root(torch.tensor([-1, 0, 1, 3])).tolist()
         [-1, 0, 0, -1]
     """
     num = len(repeat_of)
-    own = torch.arange(num)
     inside = (repeat_of >= -1) & (repeat_of < num) & (repeat_of == repeat_of.round())
-    require(
-        bool(inside.all()),
-        f"repeat_of among the positions 0 to {num - 1}, or -1 for none",
-        repeat_of.tolist(),
-        "pass the position of the trial it repeats",
-    )
-    before = torch.where(repeat_of < 0, own, repeat_of.long())
-    first = before
-    for _ in range(num):
-        first = before[first]
-    got, advice = f"{repeat_of.tolist()}, which runs in a circle", "pass -1 for it"
-    is_first = bool((before[first] == first).all())
-    require(is_first, "repeats that lead back to a first trial", got, advice)
-    return first.where(first != own, torch.tensor(-1))
+    expected = f"repeat_of among the positions 0 to {num - 1}, or -1 for none"
+    advice = "pass the position of the trial it repeats"
+    require(bool(inside.all()), expected, repeat_of.tolist(), advice)
+    own = np.arange(num)
+    of = np.where(repeat_of < 0, own, repeat_of.long())
+    links = coo_array((np.ones(num), (own, of)), shape=(num, num))
+    _, setting = connected_components(links, directed=False)
+    return repeated(torch.from_numpy(setting)[:, None])
 
 
-def require_names(names: Sequence[object] | None, num: int) -> tuple[str, ...] | None:
-    """Return names of trials as text, or raise where they are not one each.
-
-    Args:
-        names: Names of the trials; None for none.
-        num: Number of trials.
-    """
-    if names is None:
-        return None
-    found = () if isinstance(names, str) else tuple(str(name).strip() for name in names)
-    each = len({*found}) == len(found) == num and "" not in found
-    expected = f"names of {num} trials, each another"
-    require(each, expected, repr(names), "name each trial, or leave names out")
-    return found
-
-
-def require_labels(
-    name: str, labels: Sequence[str] | None, sizes: Sequence[int]
+def texts(
+    what: str,
+    values: Sequence[object] | None,
+    sizes: Sequence[int],
+    *,
+    distinct: bool = False,
 ) -> tuple[str, ...] | None:
-    """Return labels as a tuple, or raise where they are not one text an entry.
+    """Return names or labels as text, or raise where they are not one each.
 
     Args:
-        name: Name of the argument.
-        labels: Labels to check; None for none.
-        sizes: Numbers of labels that are allowed.
+        what: What they are of, as in "names of 2 trials, each another".
+        values: Names or labels; None for none.
+        sizes: Numbers of them that are allowed.
+        distinct: Whether each has to be another, and none empty.
     """
-    if labels is None:
+    if values is None:
         return None
-    found = () if isinstance(labels, str) else (*labels,)
-    are = len(found) in sizes and all(isinstance(each, str) for each in found)
-    expected = f"{name} of {sizes[0]} strings, one an entry"
-    require(are, expected, repr(labels), "pass a list of as many")
+    found = () if isinstance(values, str) else tuple(str(v).strip() for v in values)
+    each = not distinct or len({*found} - {""}) == len(found)
+    require(len(found) in sizes and each, what, repr(values), "pass a list of as many")
     return found
 
 
@@ -169,44 +159,11 @@ def sample_times_of(times: Any, x: Tensor, names: Sequence[str]) -> Tensor | Non
     has_x = x.isfinite().reshape(n, k, -1).any(-1)
     for stamps, has, name in zip(tensor.expand(n, k), has_x, names, strict=True):
         own = stamps[stamps.isfinite()]
-        got = f"{len(own)} in trial {name}"
-        known = bool((stamps.isfinite() | ~has).all())
-        require(known, "a time of each sample in sample_times", got, each)
-        got = f"{own.tolist()[:6]}... in trial {name}"
-        increase = bool((own.diff() > 0).all())
-        require(increase, "sample_times that increase", got, "sort its samples by time")
+        is_known = bool((stamps.isfinite() | ~has).all() and (own.diff() > 0).all())
+        got = f"{own.tolist()[:6]}... for {int(has.sum())} samples of trial {name}"
+        expected = "sample_times that increase, one a sample"
+        require(is_known, expected, got, "sort its samples by time")
     return tensor
-
-
-def start_states(start: Any, num: int) -> Tensor | dict[str, Tensor] | None:
-    """Return measured start states, shape (num, d) or {name: (num,)}.
-
-    Args:
-        start: Start states as given; None for none.
-        num: Number of trials.
-
-    Raises:
-        ValueError: If there is not one of finite numbers a trial.
-    """
-    if start is None:
-        return None
-    if not isinstance(start, Mapping):
-        value = measured(start, name="start")
-        return _starts(value[:, None] if value.ndim == 1 else value, num, 2, "start")
-    named = {str(name): value for name, value in start.items()}
-    return {name: _starts(value, num, 1, name) for name, value in named.items()}
-
-
-def _starts(start: Any, num: int, ndim: int, name: str) -> Tensor:
-    value = measured(start, name=name)
-    expected = f"start states of shape ({num}, d), or {{name: ({num},)}}"
-    is_one = value.ndim == ndim and len(value) == num
-    require(is_one, expected, f"{tuple(value.shape)} of {name!r}", "give one a trial")
-    lost = (~value.reshape(num, -1).isfinite().all(-1)).nonzero()[:, 0].tolist()
-    got = f"{name!r} without a number in trials {lost}"
-    advice = "leave these out, or declare the start as an effect of scope 'trial'"
-    require(not lost, "finite start states", got, advice)
-    return value
 
 
 def rows_at(value: Any, at: Any) -> Any:
@@ -221,13 +178,3 @@ def rows_joined(own: Any, further: Any) -> Any:
     if isinstance(own, Mapping):
         return {name: torch.cat([part, further[name]]) for name, part in own.items()}
     return None if own is None else torch.cat([own, further])
-
-
-def roles_of(role: Sequence[Role] | None, n: int) -> list[Role]:
-    """Return a role for each of n trials, "fit" where none is given."""
-    given = ["fit"] * n if role is None else role
-    roles: list[Any] = [str(each).replace("_", " ") for each in given]
-    is_known = len(roles) == n and {*roles} <= {"fit", "held out"}
-    expected = f"a role 'fit' or 'held out' for each of {n} trials"
-    require(is_known, expected, roles, "give one each")
-    return roles

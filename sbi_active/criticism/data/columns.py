@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 from sbi_active.expected import did_you_mean, require
@@ -41,18 +41,16 @@ def to_si(unit: str) -> tuple[float, str] | None:
         >>> to_si("deg/s")
         (0.0174..., 'rad/s')
     """
-    factor, sign, text, at = 1.0, 1, "", 0
-    while at < len(unit):
-        token = _TOKEN.match(unit, at)
-        if token is None:
-            return None
-        at, said = token.end(), token.group()
+    factor, sign, text = 1.0, 1, ""
+    tokens = [*_TOKEN.finditer(unit)]
+    words = [token["word"] for token in tokens if token["word"]]
+    if _TOKEN.sub("", unit) or not {*words} <= WORDS.keys():
+        return None
+    for token in tokens:
         if token["word"] is None:
-            sign = -1 if said == "/" else sign
-            text += said
+            sign = -1 if token.group() == "/" else sign
+            text += token.group()
             continue
-        if token["word"] not in WORDS:
-            return None
         scale, si = WORDS[token["word"]]
         power = token["power"].replace("²", "2").replace("³", "3").lstrip("^*") or "1"
         factor *= scale ** (sign * int(power))
@@ -64,15 +62,11 @@ def split(column: str) -> tuple[str, str]:
     """Return the name in a column or a label, and the unit; "" if there is none.
 
     Example:
-        >>> split("angle [deg]"), split("time_ms"), split("x_height")
-        (('angle', 'deg'), ('time', 'ms'), ('x_height', ''))
+        >>> split("angle [deg]"), split("x_height")
+        (('angle', 'deg'), ('x_height', ''))
     """
     match = re.fullmatch(r"(.*?)\s*\[(.*)\]\s*", column)
-    if match is not None:
-        return match[1], match[2].strip()
-    end = time_unit(column)
-    is_time = end and column == f"{TIME}_{end}"
-    return (TIME, end) if is_time else (column, "")
+    return (column, "") if match is None else (match[1], match[2].strip())
 
 
 def time_unit(column: str) -> str:
@@ -82,26 +76,29 @@ def time_unit(column: str) -> str:
 
 
 TRIAL = "trial"
-#: Beginnings of the names of columns that there may be several of.
-PREFIXES = {"action": "action_", "x": "x_", "input": "input_", "start": "start_"}
+#: Roles that several columns may have, whose names begin with it, as in "x_height".
+SEVERAL = ("action", "x", "input", "start")
 OPTIONAL = ("role", "index", "repeat_of")
-KEYS = (TRIAL, TIME, *PREFIXES, *OPTIONAL)
+KEYS = (TRIAL, TIME, *SEVERAL, *OPTIONAL)
 
 #: Names of columns by what they are, where they have names of their own.
 Told = Mapping[str, str | Sequence[str]]
+Units = Mapping[str, str]  # by column
 
 
 @dataclass(frozen=True)
 class Column:
-    """A column of numbers, in SI where its unit is known.
+    """A column of a table, in SI where its unit is known.
 
     Attributes:
+        role: Role of its cells, one of :data:`KEYS`.
         header: Name of the column in the table.
-        name: Name without the beginning and the unit.
-        unit: Unit of its numbers here; "" if none was said.
+        name: Name without the role and the unit.
+        unit: Unit of its numbers; "" if none was said.
         factor: Factor from the table's numbers to that unit.
     """
 
+    role: str
     header: str
     name: str
     unit: str = ""
@@ -114,13 +111,9 @@ class Column:
 
 
 def find_columns(
-    headers: Sequence[str],
-    *,
-    columns: Told | None = None,
-    units: Mapping[str, str] | None = None,
-    source: str = "the table",
-) -> dict[str, list[Column]]:
-    """Return the columns by what they are, by their names or as the user says.
+    headers: Sequence[str], columns: Told | None, units: Units | None, source: str
+) -> list[Column]:
+    """Return the columns of a table, by their names or as the user says.
 
     Args:
         headers: Names of all columns.
@@ -131,111 +124,102 @@ def find_columns(
         source: Name of the table in messages.
 
     Raises:
-        ValueError: If a column is missing, unknown or there twice, or has two units.
+        ValueError: If a column is unknown or there twice, or has two units.
     """
+    told = [(_role_of(split(header)[0]), header) for header in headers]
     if columns is None:
-        roles, single = _by_name(headers, source), (TRIAL, TIME, *OPTIONAL)
+        unknown = ", ".join(header for role, header in told if not role)
+        # A table in which nothing has such a name is said to lack those.
+        known = {role for role, _ in told}
+        is_understood = "input" in known or {"action", "x"} <= known
+        advice = "rename or remove what is none of these, or say which are what by "
+        advice += "columns= (--columns x=NAME)"
+        got, is_known = f"{unknown} in {source}", not (unknown and is_understood)
+        require(is_known, f"columns {_in_words(KEYS)}", got, advice)
+        told = [(role, header) for role, header in told if role]
     else:
-        roles, single = _as_told(headers, columns, source), (TIME, *OPTIONAL)
-    for role in single:
-        got = f"{', '.join(roles[role])} in {source}"
-        require(len(roles[role]) <= 1, f"one column for {role}", got, "keep one")
-    used = [header for group in roles.values() for header in group]
-    names = [split(header)[0] for header in headers]
-    for header in used:
-        same = [h for h, n in zip(headers, names, strict=True) if n == split(header)[0]]
+        of = {split(name)[0]: name for name in headers} | {
+            name: name for name in headers
+        }
+        told = [(role, of[name]) for role, name in pairs(columns) if name in of]
+    for role in (TIME, *OPTIONAL):
+        every = [header for own, header in told if own == role]
+        got = f"{', '.join(every)} in {source}"
+        require(len(every) <= 1, f"one column for {role}", got, "keep one")
+    for _, header in told:
+        same = [each for each in headers if split(each)[0] == split(header)[0]]
         got = f"{' and '.join(same)} in {source}"
         require(len(same) == 1, "each quantity once", got, "remove or rename one")
-    return {
-        role: [_column(role, header, units or {}, source) for header in group]
-        for role, group in roles.items()
-    }
+    return [_column(role, header, units or {}, source) for role, header in told]
+
+
+def pairs(columns: Told) -> list[tuple[str, str]]:
+    """Return the role and the name of each column that a user names.
+
+    Raises:
+        ValueError: If a role is none.
+    """
+    for role in columns:
+        expected = f"columns of {', '.join(KEYS)}"
+        require(role in KEYS, expected, role, "say which columns are these")
+    each = {role: [n] if isinstance(n, str) else n for role, n in columns.items()}
+    return [(role, name) for role, names in each.items() for name in names]
+
+
+def require_named(names: Iterable[str], headers: Sequence[str], source: str) -> None:
+    """Raise if no column has a name, with or without what stands in brackets."""
+    known = {*headers} | {split(header)[0] for header in headers}
+    for name in names:
+        got = f"{', '.join(headers)} in {source}"
+        advice = did_you_mean(name, headers, "correct the name")
+        require(name in known, f"a column {name}", got, advice)
 
 
 def require_columns(
-    found: Mapping[str, Sequence[Column]], needed: Sequence[str], source: str
+    found: Sequence[Column], needed: Sequence[str], source: str
 ) -> None:
     """Raise if a table lacks columns.
 
     Args:
-        found: Columns by what they are.
-        needed: Kinds of columns that it needs.
+        found: Columns of the table.
+        needed: Roles that it needs.
         source: Name of the table in messages.
     """
-    there = [column.header for group in found.values() for column in group]
-    names = [f"{PREFIXES[role]}*" if role in PREFIXES else role for role in needed]
+    headers = ", ".join(column.header for column in found)
     require(
-        all(found[role] for role in needed),
-        f"columns {', '.join(names)}",
-        f"{', '.join(there) or 'none of these'} in {source}",
+        {*needed} <= {column.role for column in found},
+        f"columns {_in_words(needed)}",
+        f"{headers or 'none of these'} in {source}",
         "name them, as in action_speed, x_distance[m] (action_none, of ones, where "
         "nothing was set), input_voltage[V] where it varies in time, or say which are "
         "what by columns= (--columns time=NAME --columns input=NAME --columns x=NAME)",
     )
 
 
-def _by_name(headers: Sequence[str], source: str) -> dict[str, list[str]]:
-    found: dict[str, list[str]] = {key: [] for key in KEYS}
-    unknown = []
-    for header in headers:
-        name = split(header)[0]
-        of_prefix = (role for role, start in PREFIXES.items() if name.startswith(start))
-        found.get(next(of_prefix, name), unknown).append(header)
-    # A table in which nothing has such a name is said to lack those.
-    is_understood = found["input"] or (found["action"] and found["x"])
-    require(
-        not (unknown and is_understood),
-        f"columns {', '.join(f'{prefix}*' for prefix in PREFIXES.values())}, {TRIAL}, "
-        f"{TIME}, {', '.join(OPTIONAL)}",
-        f"{', '.join(unknown)} in {source}",
-        "rename or remove what is none of these, or say which are what by columns= "
-        "(--columns x=NAME)",
-    )
-    return found
+def _in_words(roles: Sequence[str]) -> str:
+    return ", ".join(f"{role}_*" if role in SEVERAL else role for role in roles)
 
 
-def _as_told(
-    headers: Sequence[str], columns: Told, source: str
-) -> dict[str, list[str]]:
-    for key in columns:
-        known = f"columns of {', '.join(KEYS)}"
-        require(key in KEYS, known, key, "say which columns are these")
-    of = {split(name)[0]: name for name in headers} | {name: name for name in headers}
-    found: dict[str, list[str]] = {key: [] for key in KEYS}
-    for role, value in columns.items():
-        for name in as_list(value):
-            require(
-                name in of,
-                f"a column {name} for {role}",
-                f"{', '.join(headers)} in {source}",
-                did_you_mean(name, headers, "correct the name"),
-            )
-            found[role].append(of[name])
-    return found
+def _role_of(name: str) -> str:
+    """Return the role that a column has by its name, "" if it is none."""
+    begin, _, end = name.partition("_")
+    if begin in SEVERAL or (begin == TIME and time_unit(end)):
+        return begin
+    return name if name in KEYS else ""
 
 
-def _column(role: str, header: str, units: Mapping[str, str], source: str) -> Column:
+def _column(role: str, header: str, units: Units, source: str) -> Column:
     name, unit = split(header)
     given = units.get(header, units.get(name, ""))
-    require(
-        not (unit and given and unit != given),
-        f"one unit of column {header}",
-        f"[{unit}] in the header of {source} and {given} in units",
-        "convert the numbers, or correct one",
-    )
+    got = f"[{unit}] in the header of {source} and {given} in units"
+    is_one = not (unit and given and unit != given)
+    advice = "convert the numbers, or correct one"
+    require(is_one, f"one unit of column {header}", got, advice)
     unit = unit or given or (time_unit(header) if role == TIME else "")
     factor, si = to_si(unit) or (1.0, unit)
-    require(
-        role != TIME or si in ("", "s"),
-        "times in s, ms, us, ns, min or h",
-        f"{unit} in column {header} of {source}",
-        "convert them",
-    )
-    for prefix in PREFIXES.values():
-        name = name.removeprefix(prefix)
-    return Column(header, name, si, factor)
-
-
-def as_list(value: str | Sequence[str]) -> list[str]:
-    """Return a name, or several, as a list."""
-    return [value] if isinstance(value, str) else [*value]
+    got, is_time = f"{unit} in column {header} of {source}", si in ("", "s")
+    expected = "times in s, ms, us, ns, min or h"
+    require(role != TIME or is_time, expected, got, "convert them")
+    for begin in SEVERAL:
+        name = name.removeprefix(f"{begin}_")
+    return Column(role, header, name, si, factor)

@@ -64,30 +64,23 @@ class Measurements:
         has_time = is_sequence or stamps is not None
         if stamps is None:
             stamps = np.arange(length, dtype=float)
-        expected = (
-            f"x of {stamps.shape[-1]} samples a trial, as the simulator has times"
-        )
+        each = stamps.shape[-1]
+        expected = f"x of {each} samples a trial, as the simulator has times"
         advice = "measure at these, or give the trials sample_times (columns time)"
-        require(stamps.shape[-1] == length, expected, f"shape {x.shape[1:]}", advice)
+        require(each == length, expected, f"shape {x.shape[1:]}", advice)
         # (trial, channel, time), where x without a time axis has one "time" a channel.
         channels = x.reshape(num, length, -1).transpose(0, 2, 1)
-        places = np.arange(x.size).reshape(num, length, -1).transpose(0, 2, 1)
-        trial, channel, _ = np.indices(channels.shape)
         stamps = np.broadcast_to(stamps, (num, length))
-        time = np.broadcast_to(stamps[:, None], channels.shape)
+        keep = np.isfinite(channels) & np.isfinite(stamps)[:, None]
+        trial, channel, place = np.nonzero(keep)
+        size = x.size // num
+        position = trial * size + place * channels.shape[1] + channel
+        time = stamps[trial, place]
         if not has_time:
-            time, channel = np.zeros(channels.shape), places % (x.size // num)
-        keep = np.isfinite(channels) & np.isfinite(time)
-        return cls(
-            channels[keep],
-            places[keep],
-            trial[keep].astype(np.int64),
-            channel[keep].astype(np.int64),
-            time[keep],
-            has_time,
-            np.asarray(np.isfinite(x.reshape(num, -1)).any(1)),
-            x.shape,
-        )
+            time, channel = 0 * time, position % size
+        valid = np.asarray(np.isfinite(x.reshape(num, -1)).any(1))
+        numbers = channels[keep], position, trial, channel, time
+        return cls(*numbers, has_time, valid, x.shape)
 
     @cached_property
     def gap(self) -> Array:

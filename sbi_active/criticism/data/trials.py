@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, Literal
 
 import pandas as pd
 import torch
@@ -15,16 +15,14 @@ from sbi_active.arrays import measured
 from sbi_active.criticism.data.arrays import (
     Role,
     kept,
+    one_each,
     padded,
     repeated,
-    require_labels,
-    require_names,
-    roles_of,
     root,
     rows_at,
     rows_joined,
     sample_times_of,
-    start_states,
+    texts,
     without_inf,
 )
 from sbi_active.criticism.data.input_series import Hold, inputs_of
@@ -60,15 +58,14 @@ class Trials:
         action_labels: Labels of the action's entries in reports, with units.
         channel_labels: Labels of the entries of x's last axis, likewise.
         inputs: Signals over time, {name: series}, each of shape (n, m), (m,) where all
-            trials share it, or a list of n arrays. An array (n, m) or a list without a
-            name is "input"; (n, m, c) is "input 1" to "input c".
+            trials share it, or a list of n arrays.
         input_times: Times of the inputs, shape (m,), (n, m), a list of n, or such by
             name, from the same origin as ``sample_times``, which they are where there
             are as many.
         input_hold: Value of an input between its times: the "previous" one, as commands
             are held, or "linear".
         input_labels: Labels of the inputs in reports, with units.
-        start: Measured start state, shape (n, d), or {name: (n,)}.
+        start: Measured start state, {name: (n,)}.
 
     Attributes:
         inputs: Inputs by name, shape (n, m), on one uniform grid for all trials: its
@@ -123,63 +120,57 @@ class Trials:
         n = len(self.x)
         self.action_is_label = action is None
         if action is None:
-            require(
-                inputs is not None or start is not None,
-                "actions, or inputs over time in their place",
-                "neither",
-                "pass what was commanded in each trial",
-            )
-            action = torch.arange(n)
+            given = inputs is not None or start is not None
+            expected = "actions, or inputs over time in their place"
+            require(given, expected, "neither", "pass what was commanded in each trial")
+            action, action_labels = torch.arange(n), action_labels or ["trial"]
         self.action = measured(action, name="action")
         if self.action.ndim == 1:
             self.action = self.action[:, None]
-        shapes = tuple(self.action.shape), tuple(self.x.shape)
-        is_one_each = len(shapes[0]) == 2 and shapes[0][0] == n and 0 not in shapes[0]
-        expected = "actions (n, action_dim) and x with as many rows"
-        got = f"{shapes[0]} and {shapes[1]}"
-        require(is_one_each, expected, got, "give one action a trial")
-        is_finite = bool(self.action.isfinite().all())
-        advice = "give each trial the action that was commanded"
-        require(is_finite, "finite actions", "NaN or inf", advice)
+        shape, lost = tuple(self.action.shape), int((~self.action.isfinite()).sum())
+        is_one_each = len(shape) == 2 and shape[0] == n and 0 not in shape and not lost
+        expected = "finite actions (n, action_dim) and x with as many rows"
+        got = f"{shape} with {lost} that are not finite, and {tuple(self.x.shape)}"
+        require(is_one_each, expected, got, "give each trial what was commanded")
         if self.x.ndim == 1:
             self.x = self.x[:, None]
-        advice = "pass what was measured, NaN for a trial without a measurement"
-        got = f"shape {shapes[1]}"
-        require(0 not in self.x.shape, "at least one number in x", got, advice)
         if mask is not None:
             self.x = self.x.where(kept(mask, self.x), torch.nan)
-        self.role = roles_of(role, n)
-        self.index = self._rows("index", torch.arange(n) if index is None else index)
-        places, is_finite = self.index.tolist(), bool(self.index.isfinite().all())
-        require(is_finite, "finite places in index", places, "pass each trial's place")
+        each = ["fit"] * n if role is None else role
+        self.role: list[Any] = [str(one).replace("_", " ") for one in each]
+        is_known = len(self.role) == n and {*self.role} <= {"fit", "held out"}
+        expected = f"a role 'fit' or 'held out' for each of {n} trials"
+        require(is_known, expected, self.role, "give one each")
+        self.index = one_each("index", range(n) if index is None else index, n)
         known = "order 'known' or 'unknown'"
-        require(order in get_args(Order), known, repr(order), "pass one of them")
+        require(order in ("known", "unknown"), known, repr(order), "pass one of them")
         self.order: Order = order
-        self._names = require_names(names, n)
+        expected = f"names of {n} trials, each another"
+        self._names = texts(expected, names, [n], distinct=True)
         self.x = without_inf(self.x, self.names)
         self.sample_times = sample_times_of(sample_times, self.x, self.names)
-        measured_x = (self.x, self.sample_times, self.names)
         self.inputs, self.input_times = inputs_of(
-            inputs, input_times, *measured_x, hold=input_hold
+            inputs, input_times, input_hold, self.x, self.sample_times, self.names
         )
-        self.start = start_states(start, n)
-        self.repeat_of = (
-            repeated(self.settings())
-            if repeat_of is None
-            else root(self._rows("repeat_of", repeat_of))
-        )
-        if action_labels is None and self.action_is_label:
-            action_labels = ["trial"]
-        self.action_labels = require_labels(
-            "action_labels", action_labels, [self.action.shape[1]]
-        )
-        self.input_labels = require_labels(
-            "input_labels", input_labels, [len(self.inputs or ())]
-        )
+        is_named = start is None or isinstance(start, Mapping)
+        expected = "start states as {name: (n,)}"
+        require(is_named, expected, type(start), "name each of them")
+        advice = "leave these out, or declare an effect of scope 'trial' in its place"
+        given = (start or {}).items()
+        parts = {str(k): one_each(str(k), v, n, advice) for k, v in given}
+        self.start: dict[str, Tensor] | None = parts or None
+        self.repeat_of = repeated(self.settings())
+        if repeat_of is not None:
+            self.repeat_of = root(one_each("repeat_of", repeat_of, n))
         # A trajectory of one channel has no axis for it.
         one = [1] if self.x.ndim == 2 and self.sample_times is not None else []
-        self.channel_labels = require_labels(
-            "channel_labels", channel_labels, [self.x.shape[-1], *one]
+        self.action_labels, self.input_labels, self.channel_labels = (
+            texts(f"{name}_labels of {sizes[0]} strings, one an entry", labels, sizes)
+            for name, labels, sizes in (
+                ("action", action_labels, [self.action.shape[1]]),
+                ("input", input_labels, [len(self.inputs or ())]),
+                ("channel", channel_labels, [self.x.shape[-1], *one]),
+            )
         )
         got, is_any = f"{n} trials without a measurement", bool(self.valid.any())
         require(is_any, "at least one valid trial", got, "check x and mask for NaN")
@@ -222,13 +213,14 @@ class Trials:
                 as ms, mm and deg; what is not known, such as px, stays as it is.
             order: Order of execution; "unknown" where rows are in any order.
             inputs: Another file, or a data frame, with the inputs at times of their
-                own: "time", "input_\*", and "trial" unless all trials share them.
+                own: "time", "input_\*", and "trial" unless all trials share them. Names
+                in columns and units hold in either table.
             input_hold: Value of an input between two times, as in the constructor.
 
         Raises:
             ValueError: If the table is not understood; the text says where.
         """
-        found = read_trials(path, columns=columns, units=units, inputs=inputs)
+        found = read_trials(path, columns, units, inputs)
         return cls(**found, order=order, input_hold=input_hold)
 
     @classmethod
@@ -262,9 +254,6 @@ class Trials:
             f"{int((~self.valid).sum())} invalid)"
         )
 
-    def __getitem__(self, positions: Any) -> Trials:
-        return self.select(positions)
-
     @property
     def names(self) -> tuple[str, ...]:
         """Names of the trials, as given, or their indices."""
@@ -293,12 +282,15 @@ class Trials:
     @property
     def fit(self) -> Trials:
         """The trials that may be fitted."""
-        return self._of("fit")
+        is_fit = torch.tensor([role == "fit" for role in self.role])
+        require(bool(is_fit.any()), "a trial of role 'fit'", "none", "change a role")
+        return self.select(is_fit)
 
     @property
     def held_out(self) -> Trials | None:
         """The held-out trials; None if there are none."""
-        return self._of("held out") if self.held_out_positions else None
+        held = self.held_out_positions
+        return self.select(held) if held else None
 
     def template(self) -> tuple[Tensor, Tensor | None]:
         """Return a trial in which all is measured that any trial has, and its times.
@@ -308,14 +300,14 @@ class Trials:
             sample times, shape (k,), NaN there too, or None.
         """
         x, times = torch.zeros_like(self.x[0]), self.sample_times
-        if times is not None:  # a sample that no trial has, such as one thinned out
-            seen = self.mask.reshape(*self.x.shape[:2], -1).any(-1).any(0)
-            x = x.where(seen.reshape(-1, *[1] * (x.ndim - 1)), torch.nan)
-        if times is None or times.ndim == 1:
-            return x, times
-        longest = times[int(times.isfinite().sum(-1).argmax())]
-        sampled = longest.isfinite().reshape(-1, *[1] * (x.ndim - 1))
-        return x.where(sampled, torch.nan), longest
+        if times is None:
+            return x, None
+        # A sample that no trial has, such as one thinned out, is none.
+        seen = self.mask.reshape(*self.x.shape[:2], -1).any(-1).any(0)
+        if times.ndim > 1:
+            times = times[int(times.isfinite().sum(-1).argmax())]
+            seen = seen & times.isfinite()
+        return x.where(seen.reshape(-1, *[1] * (x.ndim - 1)), torch.nan), times
 
     def select(self, positions: Any) -> Trials:
         """Return some trials, with their indices.
@@ -328,17 +320,16 @@ class Trials:
         ].reshape(-1)
         own = torch.arange(len(self))
         first = torch.where(self.repeat_of < 0, own, self.repeat_of)[at]
-        # Where the first trial is left out, the others repeat the first that is kept.
-        new = {int(place): i for i, place in reversed([*enumerate(first)])}
-        new |= {int(old): i for i, old in enumerate(at)}
         some = copy.copy(self)
         for name in self._by_trial():
             setattr(some, name, rows_at(getattr(self, name), at))
         some.role = [self.role[i] for i in at]
-        some.repeat_of = root(torch.tensor([new[int(place)] for place in first]))
+        some.repeat_of = repeated(first[:, None])
         if self._names is not None:  # of trials that may be there twice now
             some._names = tuple(self._names[i] for i in at)
         return some
+
+    __getitem__ = select
 
     def joined(self, further: Trials) -> Trials:
         """Return these trials with further ones of the same machine behind them."""
@@ -361,25 +352,9 @@ class Trials:
         own = ["sample_times"] if times is not None and times.ndim > 1 else []
         return ["action", "x", "index", "inputs", "start", *own]
 
-    def _of(self, role: Role) -> Trials:
-        positions = [i for i, r in enumerate(self.role) if r == role]
-        got = f"none of {len(self)}"
-        require(bool(positions), f"a trial of role {role!r}", got, "change it")
-        return self.select(positions)
-
     def settings(self) -> Tensor:
         """Return all that was set in each trial, shape (n, k); a label is not."""
         parts = [] if self.action_is_label else [self.action]
-        parts += [*(self.inputs or {}).values()]
-        if isinstance(self.start, dict):
-            parts += [value[:, None] for value in self.start.values()]
-        elif self.start is not None:
-            parts.append(self.start)
+        parts += (self.inputs or {}).values()
+        parts += [value[:, None] for value in (self.start or {}).values()]
         return torch.cat(parts, -1)
-
-    def _rows(self, name: str, value: Any) -> Tensor:
-        tensor = measured(value, name=name)
-        expected = f"{name} of shape ({len(self)},), one a trial"
-        shape = tuple(tensor.shape)
-        require(shape == (len(self),), expected, shape, "give one each")
-        return tensor

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -12,12 +12,7 @@ import torch
 from torch import Tensor
 from typing_extensions import override
 
-from sbi_active.criticism.effects.application import (
-    applied,
-    largest_change,
-    nulls,
-    require_positive,
-)
+from sbi_active.criticism.effects.application import applied
 from sbi_active.criticism.effects.effect import Context, Effect, require_distinct
 from sbi_active.expected import require
 from sbi_active.seeding import forked_generators, row_seeds
@@ -36,17 +31,21 @@ from sbi_active.simulation.model import NOISE_STREAM
 NUM_CHECKED, NUM_FIRST = 16, 3
 
 
+Phi = dict[str, Tensor]  # parameters by effect, shape (n, phi_dim)
+
+
 @dataclass(frozen=True)
 class _Rows:
-    """Effects in rows: phi by effect, actions as commanded, conditions."""
+    """Effects in rows: phi, actions as commanded, conditions, and further keywords."""
 
-    phi: dict[str, Tensor]
+    phi: Phi
     action: Tensor
     context: Context
+    keywords: dict[str, Any]
 
     def at(self, some: slice) -> _Rows:
         """Return some rows, without effects."""
-        return _Rows({}, self.action[some], self.context.at(some))
+        return _Rows({}, self.action[some], self.context.at(some), {})
 
 
 class AugmentedSimulator(SimulatorModel):
@@ -60,7 +59,7 @@ class AugmentedSimulator(SimulatorModel):
 
     Called as any simulator, with (theta, phi) and an action, the rows are those of the
     *next* trial, whose index is ``next_index``: an effect that grows with the index
-    goes on from there. :meth:`evaluate` takes an index a row.
+    goes on from there. :meth:`evaluate` takes a context, with an index a row.
 
     Args:
         model: The simulator; an augmented one is extended.
@@ -88,13 +87,11 @@ class AugmentedSimulator(SimulatorModel):
         next_index: int = 0,
     ) -> None:
         is_more = isinstance(model, AugmentedSimulator)
-        before = model.effects if is_more else []
-        base = self.base = model.base if is_more else model
+        base, before = (model.base, model.effects) if is_more else (model, [])
+        self.base = base
         self.effects = [*before, *effects]
         require_distinct(self.effects, base.parameter_names or ())
         self.next_index = next_index
-        times = getattr(model, "sample_times", None)
-        self._times = None if times is None else torch.as_tensor(times).double().clone()
         names = base.parameter_names
         if names is not None:
             campaign = [e for e in self.effects if e.scope == "campaign"]
@@ -106,14 +103,14 @@ class AugmentedSimulator(SimulatorModel):
             setup=base.setup,
             parameter_names=names,
             channel_names=base.channel_names,
-            sample_times=self._times,
+            sample_times=base.sample_times,
             inputs=base.inputs,
         )
         self._unchecked = [e for e in effects if e not in before]
         if check is not None and self._unchecked:
             known = sum(e.phi_dim for e in before if e.scope == "campaign")
             theta, action, *own = check
-            rows = self._rows({}, action, context=own[0] if own else None)
+            rows = self._rows({}, action, *own)
             self._check_null(theta[:, : theta.shape[1] - known], rows)
 
     @property
@@ -130,10 +127,9 @@ class AugmentedSimulator(SimulatorModel):
     def evaluate(
         self,
         theta: Tensor,
-        phi: dict[str, Tensor],
+        phi: Phi,
         action: Tensor,
         *,
-        index: Tensor | None = None,
         context: Context | None = None,
         seeds: Tensor | None = None,
         merge: bool = False,
@@ -146,9 +142,8 @@ class AugmentedSimulator(SimulatorModel):
             theta: Parameters of the base simulator, shape (n, theta_dim).
             phi: Parameters by effect, (n, phi_dim); effects that are left out vanish.
             action: Actions as commanded, shape (n, action_dim).
-            index: Place of each row's trial, shape (n,); None is ``next_index``.
-            context: Conditions under which each row's trial was run, in place of the
-                index.
+            context: Conditions under which each row's trial was run; None is the next
+                trial.
             seeds: Seeds, one a row, for a simulator that takes them; None gives each
                 row 0 where the noise is declared.
             merge: Whether to simulate equal rows only once, as where an action was
@@ -157,18 +152,12 @@ class AugmentedSimulator(SimulatorModel):
         Returns:
             Shape (n, *x_shape).
         """
-        rows = self._rows(phi, action, index, context)
+        rows = self._rows(phi, action, context)
         merge = merge and self.noise is not None  # a draw is another at each call
         return self._checked(theta, rows, seeds, merge=merge)
 
     def noise_scale(
-        self,
-        phi: dict[str, Tensor],
-        action: Tensor,
-        sd: Tensor,
-        *,
-        index: Tensor | None = None,
-        context: Context | None = None,
+        self, phi: Phi, action: Tensor, sd: Tensor, *, context: Context | None = None
     ) -> Tensor:
         """Return the noise's standard deviation with effects, of the shape of ``sd``.
 
@@ -176,12 +165,11 @@ class AugmentedSimulator(SimulatorModel):
             phi: Parameters by effect, as in :meth:`evaluate`.
             action: Shape (n, action_dim).
             sd: Standard deviation without effects, shape (n, *x_shape).
-            index: Place of each row's trial, as in :meth:`evaluate`.
             context: Context of the rows, as in :meth:`evaluate`.
         """
-        return self._through("noise", sd, self._rows(phi, action, index, context))
+        return self._through("noise", sd, self._rows(phi, action, context))
 
-    def split(self, parameters: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
+    def split(self, parameters: Tensor) -> tuple[Tensor, Phi]:
         """Return theta and phi by effect from (theta, phi), shape (n, dim)."""
         campaign = [e for e in self.effects if e.scope == "campaign"]
         sizes = [e.phi_dim for e in campaign]
@@ -197,7 +185,7 @@ class AugmentedSimulator(SimulatorModel):
         self, theta: Tensor, action: Tensor, seeds: Tensor | None = None, **effects: Any
     ) -> Tensor:
         drawn = self._trial_draws(len(theta), theta.dtype, seeds)
-        mean = self._run(theta, action, seeds, effects, drawn)
+        mean = self._run(theta, action, seeds, effects, drawn=drawn)
         if self.noise is None:
             return mean
         if self.fn_takes_seeds and seeds is not None:
@@ -209,23 +197,15 @@ class AugmentedSimulator(SimulatorModel):
         scale = self.noise_scale(phi, action, one)
         return x if scale is one else mean + (x - mean) * scale
 
+    @override
     def _run(
-        self,
-        theta: Tensor,
-        action: Tensor,
-        seeds: Tensor | None,
-        effects: Mapping[str, Any],
-        drawn: dict[str, Tensor] | None = None,
+        self, theta: Any, action: Any, seeds: Any, effects: Any, *, drawn: Any = None
     ) -> Tensor:
         theta, phi = self.split(torch.as_tensor(theta))
-        told = {name: effects[name] for name in CONDITIONS if name in effects}
-        rest = {name: value for name, value in effects.items() if name not in told}
-        rows = self._rows(phi | (drawn or {}), torch.as_tensor(action), **told)
-        return self._checked(theta, rows, seeds, rest)
+        rows = self._rows(phi | (drawn or {}), torch.as_tensor(action), **effects)
+        return self._checked(theta, rows, seeds)
 
-    def _trial_draws(
-        self, num: int, dtype: torch.dtype, seeds: Tensor | None
-    ) -> dict[str, Tensor]:
+    def _trial_draws(self, num: int, dtype: torch.dtype, seeds: Tensor | None) -> Phi:
         """Return draws of the effects of scope "trial", rows by their seeds."""
         trial = [e for e in self.effects if e.scope == "trial"]
         if seeds is None or not trial:
@@ -238,44 +218,28 @@ class AugmentedSimulator(SimulatorModel):
         return {e.name: d for e, d in zip(trial, draws, strict=True)}
 
     def _rows(
-        self,
-        phi: dict[str, Tensor],
-        action: Tensor,
-        index: Tensor | None = None,
-        context: Context | None = None,
-        **told: Any,
+        self, phi: Phi, action: Tensor, context: Context | None = None, **told: Any
     ) -> _Rows:
         """Return rows with what effects may know of them, of the type of actions."""
-        if index is None:
-            index = torch.full((len(action),), float(self.next_index))
-        known = vars(context or Context(index)) | told
+        if context is None:
+            context = Context(torch.full((len(action),), float(self.next_index)))
+        own = {name: told.pop(name) for name in [*told] if name not in CONDITIONS}
+        known = vars(context) | told
         if known["times"] is None:
-            known["times"] = self._times
-        return _Rows(phi, action, Context(**typed(known, action.dtype)))
+            known["times"] = self.sample_times
+        return _Rows(phi, action, Context(**typed(known, action.dtype)), own)
 
     def _checked(
-        self,
-        theta: Tensor,
-        rows: _Rows,
-        seeds: Tensor | None,
-        keywords: Mapping[str, Any] | None = None,
-        *,
-        merge: bool = False,
+        self, theta: Tensor, rows: _Rows, seeds: Any, *, merge: bool = False
     ) -> Tensor:
         """Return x, after a look at whether effects vanish in the first rows."""
         few = slice(NUM_FIRST)
         if self._unchecked and len(theta):
             self._check_null(theta[few], rows.at(few))
-        return self._evaluate(theta, rows, seeds, keywords, merge=merge)
+        return self._evaluate(theta, rows, seeds, merge=merge)
 
     def _evaluate(
-        self,
-        theta: Tensor,
-        rows: _Rows,
-        seeds: Tensor | None,
-        keywords: Mapping[str, Any] | None = None,
-        *,
-        merge: bool = False,
+        self, theta: Tensor, rows: _Rows, seeds: Any, *, merge: bool = False
     ) -> Tensor:
         if seeds is None and self.noise is not None:
             seeds = torch.zeros(len(theta), dtype=torch.int64)
@@ -284,8 +248,7 @@ class AugmentedSimulator(SimulatorModel):
         if rows.context.inputs is None and self.base.inputs is not None:
             signals = played(self.base.inputs, action, action.dtype)
             rows = replace(rows, context=replace(rows.context, **signals))
-        told = self._told(rows) | dict(keywords or {})
-        told = self._through("dynamics", told, rows)
+        told = self._through("dynamics", self._told(rows) | rows.keywords, rows)
         run = self._run_merged if merge else self.base._run
         return self._through("observation", run(theta, action, seeds, told), rows)
 
@@ -301,23 +264,16 @@ class AugmentedSimulator(SimulatorModel):
         """Return what the simulator's function is told of how its trials are run."""
         context, wanted = rows.context, self.base.conditions
         acting = [e for e in self.effects if e.hook == "input" and e.name in rows.phi]
-        for effect in acting:
-            require(
-                context.inputs is not None and "inputs" in wanted,
-                f"inputs over time for effect {effect.name!r}, in the trials and as an "
-                "argument of the simulator's function",
-                "no such argument" if context.inputs else "none in the trials",
-                "pass Trials(inputs=...), and take fn(theta, action, *, inputs)",
-            )
+        names = ", ".join(effect.name for effect in acting)
+        is_told = not acting or (context.inputs is not None and "inputs" in wanted)
+        expected = f"inputs over time for {names}, in the trials and the simulator"
+        advice = "pass Trials(inputs=...), and take fn(theta, action, *, inputs)"
+        require(is_told, expected, "none in one of them", advice)
         inputs = self._through("input", context.inputs, rows)
         return replace(context, inputs=inputs).told(wanted)
 
     def _run_merged(
-        self,
-        theta: Tensor,
-        action: Tensor,
-        seeds: Tensor | None,
-        keywords: dict[str, Any],
+        self, theta: Tensor, action: Tensor, seeds: Any, keywords: dict[str, Any]
     ) -> Tensor:
         """Run each distinct row once."""
         columns: list[Any] = [theta, action, *([] if seeds is None else [seeds])]
@@ -345,26 +301,29 @@ class AugmentedSimulator(SimulatorModel):
             return
         finite, one = x[x.isfinite()].double(), torch.ones_like(x)
         spread = float(finite.std()) if len(finite) > 1 else 0.0
-        scale = max(spread, float(finite.abs().mean()) if len(finite) else 0.0, 1e-30)
+        size = max(spread, float(finite.abs().mean()) if len(finite) else 0.0, 1e-30)
         for effect in self._unchecked:
-            is_noise = effect.hook == "noise"
-            what, without, size = (
-                ("the noise", one, 1.0) if is_noise else ("x", x, scale)
-            )
-            found = []
-            for null in nulls(effect, x):
-                own = replace(rows, phi={effect.name: null})
+            is_noise, least = effect.hook == "noise", torch.inf
+            what, without = ("the noise", one) if is_noise else ("x", x)
+            null = [effect.null_phi(len(x)), effect.null_phi(len(x), finite=True)]
+            for phi in null if bool(null[0].isinf().any()) else null[:1]:
+                own = replace(rows, phi={effect.name: phi.to(x.dtype)})
                 at_null = self._seeded(theta, own)
                 at_null = self._through("noise", one, own) if is_noise else at_null
-                found.append(largest_change(without, at_null))
+                least = min(least, _change(without, at_null))
             require(
-                min(found) <= tolerance * size,
+                least <= tolerance * (1.0 if is_noise else size),
                 f"effect {effect.name!r} to vanish at its null {effect.null}",
-                f"{what} changed by up to {min(found):.3g}",
+                f"{what} changed by up to {least:.3g}",
                 "correct apply or null",
             )
             if is_noise:
-                require_positive(effect, one, rows.action, rows.context)
+                phi = effect.declared_draws()[: len(x)].to(x.dtype)
+                sd = applied(effect, one, phi, rows.action, rows.context)
+                got = f"{float(sd.min()):.3g} times its size at a phi of its prior"
+                expected = f"effect {effect.name!r} to keep the noise positive"
+                advice = "pass a prior without such phi, or another apply"
+                require(bool((sd > 0).all()), expected, got, advice)
         self._unchecked = []
 
     def _seeded(self, theta: Tensor, rows: _Rows) -> Tensor:
@@ -372,3 +331,10 @@ class AugmentedSimulator(SimulatorModel):
         seeds = row_seeds(0, len(theta))
         with forked_generators(0, "null"):
             return self._evaluate(theta, rows, seeds)
+
+
+def _change(reference: Tensor, x: Tensor) -> float:
+    """Return the largest difference of x; inf if a number turns into NaN or back."""
+    same = (x == reference) | (x.isnan() & reference.isnan())
+    gap = (x - reference).abs().where(~same, torch.zeros_like(reference))
+    return float(gap.nan_to_num(torch.inf).max())

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from sbi_active.criticism.effects.effect import Context
+from sbi_active.expected import require
 
 
 @dataclass(frozen=True)
@@ -45,10 +46,6 @@ def _lift(phi: Tensor, value: Tensor) -> Tensor:
     return phi.reshape(len(phi), *[1] * (value.ndim - 2), phi.shape[1])
 
 
-def _limited(value: Tensor, limit: Tensor) -> Tensor:
-    return torch.minimum(torch.maximum(value, -limit), limit)
-
-
 def _since_start(x: Tensor, context: Context) -> Tensor:
     """Return the time since the first sample, of a shape that acts on x."""
     times = _times(x, context)
@@ -56,12 +53,11 @@ def _since_start(x: Tensor, context: Context) -> Tensor:
 
 
 def _times(x: Tensor, context: Context) -> Tensor:
-    if context.times is None:
-        raise ValueError(
-            "expected sample times for an effect along them; got none; give "
-            "SimulatorModel(sample_times=...) or Trials(sample_times=...)"
-        )
-    return context.times.to(x.dtype).expand(len(x), -1)
+    expected, times = "sample times for an effect along them", context.times
+    advice = "give SimulatorModel(sample_times=...) or Trials(sample_times=...)"
+    require(times is not None, expected, "none", advice)
+    assert times is not None
+    return times.to(x.dtype).expand(len(x), -1)
 
 
 def _step(context: Context) -> Tensor:
@@ -73,8 +69,8 @@ def _step(context: Context) -> Tensor:
 CHANGES: dict[str, Callable[[Tensor, Tensor, Context], Tensor]] = {
     "offset": lambda x, phi, c: x + _lift(phi, x),
     "gain": lambda x, phi, c: x * (1 + _lift(phi, x)),
-    "limit": lambda x, phi, c: _limited(x, _lift(phi, x)),
-    "log limit": lambda x, phi, c: _limited(x, _lift(phi.exp(), x)),
+    "limit": lambda x, phi, c: x.clamp(-_lift(phi, x), _lift(phi, x)),
+    "log limit": lambda x, phi, c: x.clamp(-_lift(phi.exp(), x), _lift(phi.exp(), x)),
     "dead zone": lambda x, phi, c: x.sign() * (x.abs() - _lift(phi, x)).clamp(min=0),
     "backlash": lambda u, phi, c: played(u, phi),
     "input delay": lambda u, phi, c: delayed_input(u, phi, _step(c)),
@@ -124,26 +120,11 @@ def played(u: Tensor, width: Tensor) -> Tensor:
         u: Series, shape (n, m); it starts in the middle of the play.
         width: w, shape (n, 1).
     """
-    half = width.clamp(min=0) / 2
-    low, high = u - half, u + half
-    # To hold y within limits, and then within further ones, is to hold it within both.
-    shift = 1
-    while shift < u.shape[1]:
-        first, later = slice(None, -shift), slice(shift, None)
-        low, high = (
-            torch.cat(
-                [
-                    part[:, :shift],
-                    torch.minimum(
-                        torch.maximum(part[:, first], low[:, later]), high[:, later]
-                    ),
-                ],
-                1,
-            )
-            for part in (low, high)
-        )
-        shift *= 2
-    return torch.minimum(torch.maximum(u[:, :1], low), high)
+    half = width.clamp(min=0)[:, 0] / 2
+    places = [u[:, 0]]
+    for each in u[:, 1:].unbind(1):
+        places.append(places[-1].clamp(each - half, each + half))
+    return torch.stack(places, 1)
 
 
 def lagged_samples(x: Tensor, tau: Tensor, times: Tensor) -> Tensor:
@@ -177,10 +158,7 @@ def delayed_samples(x: Tensor, tau: Tensor, times: Tensor) -> Tensor:
         tau: Delay, shape (n, 1).
         times: Sample times, as in :func:`lagged_samples`.
     """
-    if x.shape[1] < 2:
-        return x
-    wanted = torch.minimum((times - tau).clamp(min=times[:, :1]), times[:, -1:])
-    return at_times(x, wanted, times)
+    return at_times(x, (times - tau).clamp(times[:, :1], times[:, -1:]), times)
 
 
 def at_times(x: Tensor, wanted: Tensor, times: Tensor) -> Tensor:
@@ -191,6 +169,8 @@ def at_times(x: Tensor, wanted: Tensor, times: Tensor) -> Tensor:
         wanted: Times that are wanted, shape (n, m).
         times: Sample times, as in :func:`lagged_samples`.
     """
+    if x.shape[1] < 2:
+        return x
     times, wanted = times.contiguous(), wanted.contiguous()
     last = times.shape[1] - 2
     low = (torch.searchsorted(times, wanted, right=True) - 1).clamp(0, last)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, Literal, get_args
 
 import torch
@@ -12,16 +12,14 @@ from torch import Tensor
 from torch.distributions import Distribution
 
 from sbi_active.arrays import measured
-from sbi_active.criticism.data.arrays import rows_at
 from sbi_active.expected import require, suggests
 from sbi_active.inference.beliefs.priors import is_discrete
 from sbi_active.seeding import forked_generators
+from sbi_active.simulation.conditions import at_rows
 from sbi_active.support import parts_of, support_of
 
 Hook = Literal["action", "input", "parameter", "dynamics", "observation", "noise"]
 SCOPES = ("campaign", "trial")
-#: Texts that an effect may do without.
-OPTIONAL = ("family", "describe")
 
 #: Stands for an infinite null where the formula has no limit in floating point.
 LARGE = 1e9
@@ -38,27 +36,21 @@ class Context:
         times: Sample times, shape (k,) or (n, k); None for x without a time axis.
         inputs: Inputs as commanded, {name: (n, m)}; None for trials without.
         input_times: Uniform grid of the inputs, shape (m,).
-        start: Measured start states, shape (n, d) or {name: (n,)}; None for none.
+        start: Measured start states, {name: (n,)}; None for none.
     """
 
     index: Tensor
     times: Tensor | None = None
     inputs: dict[str, Tensor] | None = None
     input_times: Tensor | None = None
-    start: Tensor | dict[str, Tensor] | None = None
+    start: dict[str, Tensor] | None = None
 
     def at(self, rows: slice) -> Context:
         """Return the context of some rows."""
-        times = self.times
-        if times is not None and times.ndim > 1:
-            times = times[rows]
-        return replace(
-            self,
-            index=self.index[rows],
-            times=times,
-            inputs=rows_at(self.inputs, rows),
-            start=rows_at(self.start, rows),
-        )
+        known = at_rows(vars(self), rows)
+        if self.times is not None and self.times.ndim == 1:
+            known["times"] = self.times  # of every row
+        return Context(**known)
 
     def told(self, names: Iterable[str]) -> dict[str, Any]:
         """Return those of some conditions that are known, times in each row."""
@@ -227,17 +219,15 @@ class _Keywords:
 def _require_parts(effect: Effect) -> None:
     """Raise if a part of an effect is none, or of another type than it should be."""
     own = f"of effect {effect.name!r}"
-    for part in ("name", "units", "family", "describe"):
-        value = getattr(effect, part)
-        is_text = isinstance(value, str) or (value is None and part in OPTIONAL)
-        require(is_text, f"{part} of an effect as text", repr(value), "pass a string")
-    require(bool(effect.name), "a name of an effect", "''", "pass one")
-    prior, is_prior = effect.prior, isinstance(effect.prior, Distribution)
-    advice, expected = "pass for example Normal(0.0, 1.0)", "a continuous torch prior"
-    require(is_prior, f"{expected} {own}", repr(prior), advice)
-    is_continuous = not any(is_discrete(part) for part in parts_of(prior.support))
-    advice = "declare one effect for each value, which then compete"
-    require(is_continuous, f"{expected} {own}", "a discrete one", advice)
+    texts = [effect.name, effect.units, effect.family or "", effect.describe or ""]
+    is_text = all(isinstance(text, str) for text in texts) and bool(effect.name)
+    require(is_text, f"name, units, family and describe {own}", texts, "pass strings")
+    is_prior = isinstance(effect.prior, Distribution) and not any(
+        is_discrete(part) for part in parts_of(effect.prior.support)
+    )
+    advice = "pass for example Normal(0.0, 1.0), and one effect for each value of a "
+    advice += "discrete quantity"
+    require(is_prior, f"a continuous torch prior {own}", effect.prior, advice)
     expected = f"apply {own} as a function of (value, phi, action, context)"
     require(callable(effect.apply), expected, repr(effect.apply), "pass one")
     for part, known in (("hook", get_args(Hook)), ("scope", SCOPES)):
@@ -250,10 +240,9 @@ def _sound_null(effect: Effect) -> Any:
     """Return the null, a copy where it is an array, or raise where it is none."""
     own, advice = f"of effect {effect.name!r}", "pass the value at which it vanishes"
     null = measured(effect.null, name=f"null {own}")
+    is_null = null.numel() in (1, effect.phi_dim) and not bool(null.isnan().any())
     expected = f"a null {own} of shape ({effect.phi_dim},), that of a draw"
-    one_each = null.numel() in (1, effect.phi_dim)
-    require(one_each, expected, tuple(null.shape), "give one each")
-    require(not bool(null.isnan().any()), f"a null {own}", "NaN", f"{advice}, or inf")
+    require(is_null, expected, null.tolist(), advice)
     lost = int((~effect.declared_draws().isfinite()).any(-1).sum())
     got = f"NaN or inf in {lost} of {NUM_DRAWS}"
     advice = "pass a prior whose draws are numbers"
@@ -295,12 +284,17 @@ def require_nested(effects: Sequence[Effect]) -> None:
     each trial are always there and need none.
     """
     for effect in effects:
-        if effect.scope == "campaign" and not _reaches_null(effect):
-            raise ValueError(
-                f"expected a prior of effect {effect.name!r} that allows its null "
-                f"{_in_words(effect)}, at which it vanishes; got {effect.prior}; "
-                "pass a prior whose support includes the null, or correct the null"
-            )
+        draws, null = effect.declared_draws(), effect.null_phi(NUM_DRAWS)
+        near = [null + step * (draws - null) for step in (0.0, 1e-6)]
+        rows = torch.cat([part.where(null.isfinite(), draws) for part in near])
+        reaches = bool((effect.log_prob(rows) > -torch.inf).any())
+        require(
+            effect.scope == "trial" or reaches,
+            f"a prior of effect {effect.name!r} that allows its null {effect.null}, at "
+            "which it vanishes",
+            effect.prior,
+            "pass a prior whose support includes the null, or correct the null",
+        )
 
 
 def require_kind(effects: Sequence[Effect]) -> None:
@@ -323,33 +317,11 @@ def require_distinct(effects: Sequence[Effect], parameters: Sequence[str] = ()) 
     """
     require_kind(effects)
     parts = [part for effect in effects for part in effect.name.split(" + ")]
-    _require_once(parts, "effects with distinct names")
     shown = [effect for effect in effects if effect.scope == "campaign"]
     entries = [name for effect in shown for name in effect.phi_names]
-    _require_once(
-        [*parameters, *entries], "effects named unlike parameters and entries of phi"
-    )
-
-
-def _require_once(names: Sequence[str], expected: str) -> None:
-    twice = sorted({name for name in names if names.count(name) > 1})
-    if twice:
-        raise ValueError(
-            f"expected {expected}; got {', '.join(twice)} more than once; rename "
-            "one of them"
-        )
-
-
-def _reaches_null(effect: Effect) -> bool:
-    """Return whether the prior allows the null; on the edge of a support it does."""
-    draws = effect.declared_draws()
-    null = effect.null_phi(NUM_DRAWS)
-    known = null.isfinite()
-    near = torch.where(known, null + 1e-6 * (draws - null), draws)
-    exact = torch.where(known, null, draws)
-    return bool((effect.log_prob(torch.cat([exact, near])) > -torch.inf).any())
-
-
-def _in_words(effect: Effect) -> str:
-    null = effect.null
-    return str(null.tolist()) if torch.is_tensor(null) else f"{null}"
+    for names, expected in (
+        (parts, "effects with distinct names"),
+        ([*parameters, *entries], "effects named unlike parameters and entries of phi"),
+    ):
+        twice = ", ".join(sorted({name for name in names if names.count(name) > 1}))
+        require(not twice, expected, f"{twice} more than once", "rename one of them")

@@ -90,12 +90,6 @@ def start_from_first_samples(
         >>> nuisance.scope, nuisance.phi_dim
         ('trial', 2)
     """
-    known = {} if trials.start is None else trials.start
-    if not isinstance(known, dict):
-        raise ValueError(
-            "expected measured start states by name; got an array; pass "
-            "Trials(start={name: ...}), whose names the simulator tells apart"
-        )
     wanted = [(v, 0) if isinstance(v, int) else v for v in start.values()]
     degree = max([1, *[order for _, order in wanted]])
     values, errors, p_value = _fitted(trials, wanted, degree, within, sd, at)
@@ -108,7 +102,7 @@ def start_from_first_samples(
         )
     copy = trials.select(slice(None))
     shown = dict(zip(start, torch.from_numpy(values.T.copy()), strict=True))
-    copy.start = {**known, **shown}
+    copy.start = {**(trials.start or {}), **shown}
     copy.repeat_of = repeated(copy.settings())
     scale = torch.from_numpy(width * errors.max(0))  # of the trial that tells least
     prior = Independent(Normal(torch.zeros_like(scale), scale), 1)
@@ -138,7 +132,7 @@ def _fitted(
     degree: int,
     within: float,
     sd: float | Sequence[float],
-    at: float | None = None,
+    at: float | None,
 ) -> tuple[Array, Array, Array]:
     """Return derivatives of polynomials at the start of each trial, (n, k).
 
@@ -154,58 +148,40 @@ def _fitted(
         The derivatives, their standard errors, and the tail probability of what the
         polynomial leaves; the last by trial, the smallest of the k.
     """
-    series, sds = _series(trials, sd, [channel for channel, _ in wanted])
-    times = trials.sample_times
-    assert times is not None
-    stamps = times.double().expand(trials.x.shape[:2]).numpy()
-    values, errors = np.empty((2, len(trials), len(wanted)))
-    p_value = np.ones(len(trials))
-    for i in range(len(trials)):
-        for j, (_, order) in enumerate(wanted):
-            t, x = _first(trials, i, stamps[i], series[i, j], within, degree)
-            t = t - (t[0] if at is None else at)
-            value, covariance = np.polyfit(t, x, degree, cov="unscaled")
-            misfit = (x - np.polyval(value, t)) / sds[j]
-            freedom, place = max(len(t) - degree - 1, 1), degree - order
-            p_value[i] = min(p_value[i], chi2.sf(np.sum(misfit**2), freedom))
-            values[i, j] = factorial(order) * value[place]
-            error = sds[j] * np.sqrt(covariance[place, place])
-            errors[i, j] = factorial(order) * error
-    return values, errors, p_value
-
-
-def _series(
-    trials: Trials, sd: float | Sequence[float], channels: Sequence[int]
-) -> tuple[Array, Array]:
-    """Return some entries of x, (n, c, k), and their sensor deviations, (c,)."""
-    advice = "pass Trials(sample_times=...)"
-    expected = "trials with sample times, which say what is first"
-    require(trials.sample_times is not None, expected, "none", advice)
-    expected, shape = "x of shape (n, k) or (n, k, channels)", tuple(trials.x.shape)
-    advice = "bring what a sample has onto one axis"
-    require(len(shape) <= 3, expected, shape, advice)
+    shape, times = tuple(trials.x.shape), trials.sample_times
+    if times is None or len(shape) > 3:
+        raise ValueError(
+            "expected trials with sample times, and x of shape (n, k) or (n, k, "
+            f"channels); got {'none' if times is None else shape}; pass "
+            "Trials(sample_times=...), and what a sample has on one axis"
+        )
     x = trials.x.double().numpy().reshape(*shape[:2], -1)
-    wrong = [c for c in channels if not 0 <= c < x.shape[2]]
+    wrong = [c for c, _ in wanted if not 0 <= c < x.shape[2]]
     expected = f"entries of x's last axis from 0 to {x.shape[2] - 1}"
     require(not wrong, expected, wrong, "number them from 0")
-    every = np.broadcast_to(np.asarray(sd, dtype=float), (x.shape[2],))
+    sds = np.broadcast_to(np.asarray(sd, dtype=float), (x.shape[2],))
     expected = "a standard deviation > 0 of the sensor"
-    require(bool((every > 0).all()), expected, sd, "pass its error")
-    return x[:, :, [*channels]].transpose(0, 2, 1), every[[*channels]]
-
-
-def _first(
-    trials: Trials, i: int, t: Array, x: Array, within: float, degree: int
-) -> tuple[Array, Array]:
-    """Return times and values of a trial's first samples, or raise if they are few."""
-    seen = np.isfinite(t) & np.isfinite(x)
-    t, x = t[seen], x[seen]
-    kept = t - t[:1] < within
-    apart = f", which are {np.median(np.diff(t)):.3g} apart" if len(t) > 1 else ""
-    require(
-        bool(kept.sum() > degree),
-        f"{degree + 1} or more samples within {within:g} of the first",
-        f"{int(kept.sum())} in {trials.called([i])}{apart}",
-        "pass a larger within, or name the unit of the times, as in time_ms",
-    )
-    return t[kept], x[kept]
+    require(bool((sds > 0).all()), expected, sd, "pass its error")
+    stamps = times.double().expand(shape[:2]).numpy()
+    values, errors, p_value = np.empty((3, len(trials), len(wanted)))
+    for i, j in np.ndindex(values.shape):
+        (channel, order), t = wanted[j], stamps[i]
+        seen = np.isfinite(t) & np.isfinite(x[i, :, channel])
+        first = seen & (t - t[seen].min(initial=np.inf) < within)
+        apart = f", {np.median(np.diff(t[seen])):.3g} apart" if seen.sum() > 1 else ""
+        require(
+            bool(first.sum() > degree),
+            f"{degree + 1} or more samples within {within:g} of the first",
+            f"{int(first.sum())} in {trials.called([i])}{apart}",
+            "pass a larger within, or name the unit of the times, as in time_ms",
+        )
+        t, own = t[first], x[i, first, channel]
+        t = t - (t[0] if at is None else at)
+        value, covariance = np.polyfit(t, own, degree, cov="unscaled")
+        misfit = (own - np.polyval(value, t)) / sds[channel]
+        freedom, place = max(len(t) - degree - 1, 1), degree - order
+        p_value[i, j] = chi2.sf(np.sum(misfit**2), freedom)
+        values[i, j] = factorial(order) * value[place]
+        error = sds[channel] * np.sqrt(covariance[place, place])
+        errors[i, j] = factorial(order) * error
+    return values, errors, p_value.min(1)

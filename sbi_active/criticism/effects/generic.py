@@ -16,7 +16,7 @@ from sbi_active.criticism.data.columns import split
 from sbi_active.criticism.data.trials import Trials
 from sbi_active.criticism.effects.changes import Wrapped
 from sbi_active.criticism.effects.effect import Context, Effect, Hook
-from sbi_active.criticism.effects.table import rows_of
+from sbi_active.criticism.effects.table import Sizes, Words, rows_of
 from sbi_active.criticism.effects.trial_conditions import conditions_for, has_own_times
 from sbi_active.expected import require
 from sbi_active.seeding import forked_generators, row_seeds
@@ -62,27 +62,24 @@ def generic_effects(
     Raises:
         ValueError: If neither noise nor prior says how large x and its errors are.
     """
-    require(
-        model.noise is not None or prior is not None,
-        "a simulator with declared noise, or its prior",
-        "neither, so nothing says how large a bias may be",
-        "give prior=",
-    )
+    is_sized = model.noise is not None or prior is not None
+    expected = "a simulator with declared noise, or its prior"
+    got = "neither, so nothing says how large a bias may be"
+    require(is_sized, expected, got, "give prior=")
     sd = None if model.noise is None else model.noise.declared_sds()
     draws = None if prior is None else _prior_draws(model, actions, prior)
-    times, signals, trials = model.sample_times, model.inputs, None
-    inputs, grid = None, None
+    trials = actions if isinstance(actions, Trials) else None
+    times, inputs, grid, signals = model.sample_times, None, None, model.inputs
     if isinstance(actions, Trials):
-        trials, inputs, grid = actions, actions.inputs, actions.input_times
-        values, units = trials.action, [_unit(n) for n in trials.action_labels or ()]
+        inputs, grid, values = actions.inputs, actions.input_times, actions.action
+        units = [split(label)[1] for label in actions.action_labels or ()]
         times = times if has_own_times(model, actions) else actions.sample_times
     else:
         values, units = actions.sample((NUM_ACTIONS,), seed=0).double(), actions.units
+    if signals is not None and inputs is None:
+        inputs, grid = signals.inputs(values), signals.input_times
     found = []
-    if signals is not None:
-        if inputs is None:
-            inputs, grid = signals.inputs(values), signals.input_times
-    elif trials is None or not trials.action_is_label:
+    if signals is None and (trials is None or not trials.action_is_label):
         unit = units[0] if len({*units}) == 1 else ""
         words = {"who": "the action", "before": "", "unit": unit}
         sizes = _command(values.float().double())  # an executed action is single
@@ -92,20 +89,23 @@ def generic_effects(
         labels = None if trials is None else trials.input_labels
         found += _of_inputs(inputs, labels, delay)
     late: dict[str, Tensor] = {}
-    if times is not None and trials is None and inputs is None:
-        late = {"late": torch.tensor([LATE * float(times.max() - times.min())])}
-    elif times is not None:
+    if times is not None:
         far = times.nan_to_num(-torch.inf).max() - times.nan_to_num(torch.inf).min()
         late = {"span": far, "delay": torch.tensor([typical_delay(times)])}
-    if trials is None or times is None:
-        return [*found, *_of_sensor(sd, draws, late)]
-    names = trials.channel_labels or model.channel_names
-    return [*found, *_of_sensors(trials.x, names, sd, draws, late)]
-
-
-def _unit(label: str) -> str:
-    """Return what stands in the brackets of a label."""
-    return split(label)[1]
+        if trials is None and inputs is None:
+            late = {"late": torch.tensor([LATE * float(far)])}
+    sensors: list[tuple[str, int | None]] = [("", None)]
+    if trials is not None and times is not None:
+        num = 1 if trials.x.ndim == 2 else trials.x.shape[2]
+        if trials.x.ndim == 3 and 1 < num <= 4:
+            names = trials.channel_labels or model.channel_names
+            names = names or [f"x {j + 1}" for j in range(num)]
+            sensors = [(split(name)[0], j) for j, name in enumerate(names)]
+        elif num == 1 and sd is not None:
+            sd = sd.mean().reshape(1)  # a sample is no channel
+    for name, channel in sensors:
+        found += _of_sensor(sd, draws, late, name, channel)
+    return found
 
 
 def typical_delay(times: Tensor) -> float:
@@ -124,22 +124,16 @@ def typical_delay(times: Tensor) -> float:
 
 
 def _made(
-    of: str,
-    hook: Hook,
-    label: str,
-    sizes: Mapping[str, Any],
-    words: Mapping[str, str],
-    **wrapped: Any,
+    of: str, hook: Hook, label: str, sizes: Sizes, words: Words, **wrapped: Any
 ) -> list[Effect]:
     """Return the effects of the table whose sizes are known."""
-    return [
-        row.made(
-            *(hook, Wrapped(row.changes, **wrapped), label, sizes, words),
-            needs_order=row.changes == "drift by trial",
-        )
-        for row in rows_of(TABLE)
-        if row.of == of and row.is_sized(sizes)
-    ]
+    found = []
+    for row in rows_of(TABLE):
+        if row.of == of and row.is_sized(sizes):
+            how: Any = {"needs_order": row.changes == "drift by trial"}
+            how["apply"] = Wrapped(row.changes, **wrapped)
+            found.append(row.made(label, sizes, words, hook=hook, **how))
+    return found
 
 
 def _command(some: Tensor) -> dict[str, Tensor]:
@@ -165,31 +159,10 @@ def _of_inputs(
         sizes = _command(value[value.isfinite()].double()[:, None])
         if bool((value.diff(dim=1) != 0).any()):
             sizes |= {"play": sizes["range"], "delay": torch.tensor([delay])}
-        words = {"who": f"the input {name}", "before": before, "unit": _unit(label)}
+        unit = split(label)[1]
+        words = {"who": f"the input {name}", "before": before, "unit": unit}
         own = before or "input"
         found += _made("command", "input", own, sizes, words, inputs=(name,))
-    return found
-
-
-def _of_sensors(
-    x: Tensor,
-    names: Sequence[str] | None,
-    sd: Tensor | None,
-    draws: tuple[Tensor, Tensor] | None,
-    late: Mapping[str, Tensor],
-) -> list[Effect]:
-    """Return effects of one sensor, or of each of up to four with their own series."""
-    num = 1 if x.ndim == 2 else x.shape[2]
-    if num == 1 or x.ndim > 3 or num > 4:
-        if num == 1 and sd is not None:
-            sd = sd.mean().reshape(1)  # a sample is no channel
-        return _of_sensor(sd, draws, late)
-    found = []
-    for j, label in enumerate(names or [f"x {j + 1}" for j in range(num)]):
-        own = None if sd is None else sd[[j if len(sd) == num else 0]]
-        part = draws and (draws[0][..., [j]], draws[1][..., [j]])
-        name = label.partition(" [")[0]
-        found += _of_sensor(own, part, late, name, f"{name}: ", channel=j)
     return found
 
 
@@ -197,9 +170,8 @@ def _of_sensor(
     sd: Tensor | None,
     draws: tuple[Tensor, Tensor] | None,
     late: Mapping[str, Tensor],
-    label: str = "",
-    at: str = "",
-    **wrapped: Any,
+    label: str,
+    channel: int | None,
 ) -> list[Effect]:
     """Return effects on an observation.
 
@@ -208,9 +180,11 @@ def _of_sensor(
         draws: Draws of x, twice; None if no prior is known.
         late: Sizes of what acts in time.
         label: Name of the sensor.
-        at: Beginning of the sentences.
-        **wrapped: Entry of x's last axis that is changed.
+        channel: Entry of x's last axis that it reads; None for all of x.
     """
+    if channel is not None:
+        sd = None if sd is None else sd[[channel if len(sd) > channel else 0]]
+        draws = draws and (draws[0][..., [channel]], draws[1][..., [channel]])
     sizes = dict(late)
     if draws is not None:
         x, again = draws
@@ -222,7 +196,8 @@ def _of_sensor(
         sd = within if sd is None else sd
     assert sd is not None
     sizes |= {"noise": sd, "one": torch.ones_like(sd)}
-    return _made("sensor", "observation", label, sizes, {"at": at}, **wrapped)
+    words = {"at": f"{label}: " if label else ""}
+    return _made("sensor", "observation", label, sizes, words, channel=channel)
 
 
 def _prior_draws(
@@ -322,11 +297,9 @@ def varying_parameters(
     names = model.parameter_names or [f"theta_{j + 1}" for j in range(len(sd))]
     effects = []
     for j, name in enumerate(names):
+        bounds = float(low[j]), float(high[j])
         for label, unit, entry, center, half in _variables(trials):
-            varied = _Varied(
-                *(j, float(sd[j]), entry, center, half),
-                bounds=(float(low[j]), float(high[j])),
-            )
+            varied = _Varied(j, float(sd[j]), entry, center, half, bounds)
             effects.append(
                 Effect(
                     f"{name} by {label}",
@@ -346,17 +319,17 @@ def varying_parameters(
 
 def _variables(trials: Trials) -> Iterator[tuple[str, str, int | None, float, float]]:
     """Yield name, unit, entry of the action, middle and half range of each variable."""
-    columns = [] if trials.action_is_label else [*trials.action.double().T]
-    plain = [f"action {k + 1}" for k in range(len(columns))]
-    labels = trials.action_labels or (["action"] if len(columns) == 1 else plain)
-    given: list[tuple[str, int | None, Tensor]] = [
-        *zip(labels, range(len(columns)), columns, strict=False)
-    ]
+    dim = trials.action.shape[1]
+    plain = ["action"] if dim == 1 else [f"action {k + 1}" for k in range(dim)]
+    labels = () if trials.action_is_label else trials.action_labels or plain
+    columns: dict[int | None, tuple[str, Tensor]] = {
+        entry: (label, trials.action[:, entry]) for entry, label in enumerate(labels)
+    }
     if trials.order != "unknown":
-        given.append(("trial", None, trials.index.double()))
-    for label, entry, column in given:
+        columns[None] = "trial", trials.index
+    for entry, (label, column) in columns.items():
         low, high = float(column.min()), float(column.max())
         if high > low:
-            name, _, unit = label.partition(" [")
-            unit = f" ({unit.removesuffix(']')})" if unit else ""
+            name, unit = split(label)
+            unit = f" ({unit})" if unit else ""
             yield name, unit, entry, (low + high) / 2, (high - low) / 2

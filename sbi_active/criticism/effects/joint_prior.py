@@ -44,7 +44,11 @@ class JointPrior(Distribution):
     @property
     @override
     def support(self) -> constraints.Constraint:  # type: ignore[override]
-        parts = [_elementwise(support_of(d)) for d in self._parts()]
+        parts = [elementwise(support_of(d)) for d in self._parts()]
+        joint = [part for part in parts if part.event_dim > 0]
+        expected = "priors whose numbers are bounded one by one"
+        advice = "give parameters in coordinates without such a constraint"
+        require(not joint, expected, f"supports {joint}", advice)
         return constraints.independent(
             constraints.cat(parts, dim=-1, lengths=self.sizes), 1
         )
@@ -100,15 +104,3 @@ def joint_prior(prior: Distribution, effects: Sequence[Effect]) -> JointPrior:
         torch.Size([4, 3])
     """
     return JointPrior(prior, [e for e in effects if e.scope == "campaign"])
-
-
-def _elementwise(support: Any) -> constraints.Constraint:
-    """Return a constraint on single numbers, which torch can concatenate."""
-    support = elementwise(support)
-    require(
-        support.event_dim == 0,
-        "priors whose numbers are bounded one by one",
-        f"a support {support}",
-        "give parameters in coordinates without such a constraint",
-    )
-    return support

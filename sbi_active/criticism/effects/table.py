@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from functools import cache
@@ -18,6 +18,8 @@ from sbi_active.criticism.effects.effect import Effect
 from sbi_active.expected import did_you_mean, require
 
 Patterns = str | Iterable[str]
+Sizes = Mapping[str, Any]  # by name
+Words = Mapping[str, str]  # in braces, by name
 
 
 def picked(
@@ -38,27 +40,21 @@ def picked(
     Raises:
         ValueError: If a pattern fits no effect.
     """
-    kept, left = (
-        [given] if isinstance(given, str) else [*given] for given in (include, exclude)
-    )
     names = [effect.name for effect in effects]
-    for pattern in [*kept, *left] if strict else ():
-        require(
-            any(fnmatchcase(name, pattern) for name in names),
-            f"patterns of names as in {names[0]!r}",
-            f"{pattern!r}, which matches none",
-            did_you_mean(pattern, names, "correct it"),
-        )
-
-    def fits(name: str, patterns: list[str]) -> bool:
-        return any(fnmatchcase(name, pattern) for pattern in patterns)
-
-    return [e for e in effects if fits(e.name, kept) and not fits(e.name, left)]
+    kept, left = set[str](), set[str]()
+    for given, fitting in ((include, kept), (exclude, left)):
+        for pattern in [given] if isinstance(given, str) else given:
+            found = {name for name in names if fnmatchcase(name, pattern)}
+            expected = f"patterns of names as in {names[0]!r}"
+            advice = did_you_mean(pattern, names, "correct it")
+            got = f"{pattern!r}, which matches none"
+            require(bool(found) or not strict, expected, got, advice)
+            fitting |= found
+    return [e for e in effects if e.name in kept - left]
 
 
 #: A factor of a formula such as "0.1 position / load^2".
 FACTOR = re.compile(r"(/?) *([\w.-]+)\^?(\d?)")
-PRIOR = re.compile(r"(log limit|limit|half|normal) +(.*)")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -69,7 +65,8 @@ class Row:
         of: Kind of element.
         effect: Name of the effect, with that of the element in braces.
         changes: What it changes.
-        prior: Prior of phi.
+        prior: Kind of the prior of phi.
+        size: Formula of its size, or several apart by commas.
         unit: Unit of phi.
         sentence: Sentence for reports.
         family: Family of the effect; "" takes the hook.
@@ -79,46 +76,34 @@ class Row:
     effect: str
     changes: str
     prior: str
+    size: str
     unit: str
     sentence: str
     family: str = ""
 
-    def made(
-        self,
-        hook: Any,
-        apply: Callable[..., Any],
-        label: str,
-        sizes: Mapping[str, Any],
-        words: Mapping[str, str],
-        **options: Any,
-    ) -> Effect:
+    def made(self, label: str, sizes: Sizes, words: Words, **options: Any) -> Effect:
         """Return the effect of an element.
 
         Args:
-            hook: Part of the simulator that it changes.
-            apply: Change of that part.
             label: Name of the element.
             sizes: Sizes that the prior is scaled by, by name.
             words: Words in braces, by name.
-            **options: Options of :class:`.Effect`.
+            **options: Hook, ``apply`` and further options of :class:`.Effect`.
         """
         has_unit = words or "{" not in self.unit
         return Effect(
             self.effect.format(label, **words).strip(),
-            hook=hook,
-            prior=prior_of(self.prior, sizes),
+            prior=prior_of(self.prior, self.size, sizes),
             null=torch.inf if "limit" in self.prior else 0.0,
-            apply=apply,
             units=self.unit.format(**words) if has_unit else "",
             family=self.family or None,
             describe=self.sentence.format(label, **words),
             **options,
         )
 
-    def is_sized(self, sizes: Mapping[str, Any]) -> bool:
+    def is_sized(self, sizes: Sizes) -> bool:
         """Return whether all sizes of the prior are known."""
-        _, formulas = _parts(self.prior)
-        names = [name for _, name, _ in FACTOR.findall(formulas)]
+        names = [name for _, name, _ in FACTOR.findall(self.size)]
         return all(name in sizes or name[0].isdigit() for name in names)
 
 
@@ -135,14 +120,14 @@ def rows_of(table: Path) -> tuple[Row, ...]:
     return tuple(Row(**dict(zip(columns, row, strict=True))) for row in rows)
 
 
-def prior_of(text: str, sizes: Mapping[str, Any]) -> Distribution:
+def prior_of(kind: str, formulas: str, sizes: Sizes) -> Distribution:
     """Return a prior, of as many numbers as its formulas have.
 
     Args:
-        text: Kind of the prior, and a formula or several apart by commas.
+        kind: Kind of the prior.
+        formulas: Formula of its size, or several apart by commas.
         sizes: Sizes in the formulas, numbers or shape (k,), by name.
     """
-    kind, formulas = _parts(text)
     numbers = [_number(formula, sizes) for formula in formulas.split(",")]
     if "limit" in kind:
         low, high = (n.log() for n in numbers) if "log" in kind else numbers
@@ -155,14 +140,7 @@ def prior_of(text: str, sizes: Mapping[str, Any]) -> Distribution:
     return Independent(one, 1, validate_args=False)
 
 
-def _parts(text: str) -> tuple[str, str]:
-    """Return the kind of a prior and its formulas."""
-    match = PRIOR.match(text)
-    assert match is not None, text
-    return match[1], match[2]
-
-
-def _number(formula: str, sizes: Mapping[str, Any]) -> Tensor:
+def _number(formula: str, sizes: Sizes) -> Tensor:
     """Return the value of a product, as in "0.1 position / load^2", shape (k,)."""
     value = 1.0
     for slash, name, power in FACTOR.findall(formula):

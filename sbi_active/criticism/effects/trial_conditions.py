@@ -8,12 +8,12 @@ import torch
 from torch import Tensor
 
 from sbi_active.actions import ActionSpace, DiscreteActions
-from sbi_active.criticism.data.arrays import rows_at
 from sbi_active.criticism.data.input_series import held_at
 from sbi_active.criticism.data.trials import Trials
 from sbi_active.criticism.effects.effect import Context
+from sbi_active.expected import require
 from sbi_active.simulation import SimulatorModel
-from sbi_active.simulation.conditions import typed
+from sbi_active.simulation.conditions import at_rows, typed
 
 
 def conditions_of_trials(
@@ -30,13 +30,8 @@ def conditions_of_trials(
     times = None if has_own_times(model, trials) else trials.sample_times
     if times is not None and times.ndim == 2:
         times = _held(times)[rows]
-    return Context(
-        index=trials.index[rows],
-        times=times,
-        inputs=rows_at(trials.inputs, rows),
-        input_times=trials.input_times,
-        start=rows_at(trials.start, rows),
-    )
+    own = {name: getattr(trials, name) for name in ("index", "inputs", "start")}
+    return Context(times=times, input_times=trials.input_times, **at_rows(own, rows))
 
 
 def conditions_for(
@@ -85,22 +80,20 @@ def with_known_inputs(
         return actions
     recorded = trials.action.unique(dim=0)
     kept = recorded[actions.contains(recorded.float())]
-    return DiscreteActions(
-        kept if len(kept) else recorded, names=actions.names, units=actions.units
-    )
+    kept = kept if len(kept) else recorded
+    return DiscreteActions(kept, names=actions.names, units=actions.units)
 
 
 def are_known(model: SimulatorModel, trials: Trials, action: Tensor) -> Tensor:
     """Return at which actions, shape (a, action_dim), trials can be simulated, (a,)."""
-    if trials.inputs is None or model.inputs is not None:
-        return torch.ones(len(action), dtype=torch.bool)
-    return _same(trials, action).any(1)
+    is_free = trials.inputs is None or model.inputs is not None
+    return _same(trials, action).any(1) | is_free
 
 
-def conditions_at(
-    model: SimulatorModel, trials: Trials, action: Tensor
-) -> dict[str, Any]:
-    """Return conditions of trials at some actions, as arguments of ``Trials``.
+def unmeasured(
+    model: SimulatorModel, trials: Trials, action: Tensor, index: Tensor
+) -> Trials:
+    """Return trials at some actions, with all numbers that any trial has.
 
     Inputs and start state are those of the first trial of the action; at an action that
     none has, inputs are the model's signals and the start is the mean of those
@@ -110,73 +103,42 @@ def conditions_at(
         model: The simulator.
         trials: Measured trials.
         action: Actions, shape (a, action_dim).
+        index: Place of each trial in the order of execution, shape (a,).
 
     Raises:
         ValueError: If inputs were recorded, and none at some of these actions.
     """
-    if trials.inputs is None and trials.start is None:
-        return {}
     same = _same(trials, action)
-    found = same.any(1)
-    first = same.int().argmax(1)
-    inputs = rows_at(trials.inputs, first)
+    found, first = same.any(1), same.int().argmax(1)
+    inputs = trials.inputs and at_rows(trials.inputs, first)
     if inputs is not None and model.inputs is not None:
-        inputs = _signals(model, trials, action, inputs, found)
-    elif inputs is not None and not bool(found.all()):
-        i = int((~found).nonzero()[0])
-        raise ValueError(
-            "expected actions whose inputs were recorded; got "
-            f"{action[i].tolist()}; permit actions of the trials alone"
-        )
-    return {
-        "inputs": inputs,
-        "input_times": trials.input_times,
-        "start": _starts(trials.start, first, found),
-    }
-
-
-def unmeasured(
-    model: SimulatorModel, trials: Trials, action: Tensor, index: Tensor
-) -> Trials:
-    """Return trials at some actions, with all numbers that any trial has.
-
-    Args:
-        model: The simulator.
-        trials: Measured trials.
-        action: Actions, shape (a, action_dim).
-        index: Place of each trial in the order of execution, shape (a,).
-    """
+        assert trials.input_times is not None
+        signals = model.inputs.inputs(action.double())
+        expected = f"the inputs of the model's signals, {', '.join(signals)}"
+        got = ", ".join(inputs)
+        require({*signals} == {*inputs}, expected, got, "name them alike")
+        played = held_at(signals, model.inputs.input_times, trials.input_times)
+        known = found[:, None]
+        inputs = {name: inputs[name].where(known, played[name]) for name in inputs}
+    elif inputs is not None:
+        lost, advice = action[~found].tolist(), "permit actions of the trials alone"
+        require(not lost, "actions whose inputs were recorded", lost, advice)
     x, times = trials.template()
-    found = Trials(
+    start = trials.start and {
+        name: part[first].where(found, part.mean())
+        for name, part in trials.start.items()
+    }
+    new = Trials(
         action.double(),
         x.expand(len(action), *x.shape),
         index=index,
         sample_times=times,
-        **conditions_at(model, trials, action),
+        inputs=inputs,
+        input_times=trials.input_times,
+        start=start,
     )
-    found.action_is_label = trials.action_is_label
-    return found
-
-
-def _signals(
-    model: SimulatorModel,
-    trials: Trials,
-    action: Tensor,
-    recorded: dict[str, Tensor],
-    found: Tensor,
-) -> dict[str, Tensor]:
-    """Return recorded inputs where there are some, and signals on their grid."""
-    assert model.inputs is not None
-    assert trials.input_times is not None
-    signals = model.inputs.inputs(action.double())
-    if {*signals} != {*recorded}:
-        raise ValueError(
-            f"expected trials with the inputs of the model's signals, "
-            f"{', '.join(signals)}; got {', '.join(recorded)}; name them alike"
-        )
-    played = held_at(signals, model.inputs.input_times, trials.input_times)
-    known = found[:, None]
-    return {name: recorded[name].where(known, played[name]) for name in recorded}
+    new.action_is_label = trials.action_is_label
+    return new
 
 
 def _same(trials: Trials, action: Tensor) -> Tensor:
@@ -184,12 +146,3 @@ def _same(trials: Trials, action: Tensor) -> Tensor:
     own, asked = trials.action.double(), action.double()
     # As far as single precision tells.
     return torch.isclose(asked[:, None], own[None], rtol=1e-5, atol=1e-7).all(-1)
-
-
-def _starts(start: Any, first: Tensor, found: Tensor) -> Any:
-    if isinstance(start, dict):
-        return {name: _starts(part, first, found) for name, part in start.items()}
-    if start is None:
-        return None
-    known = found.reshape(-1, *[1] * (start.ndim - 1))
-    return start[first].where(known, start.mean(0))

@@ -184,8 +184,7 @@ class FormForce:
         if not self.form.startswith("free"):
             return FORMS[self.form][1](at, speed, time, trial)[:, None]
         kind = self.form.removeprefix("free f(").removesuffix(")")
-        k = int(kind == "v")
-        place = speed if kind == "v" else at
+        k, place = (1, speed) if kind == "v" else (0, at)
         share = (place - own.low[k]) / (own.high[k] - own.low[k])
         if kind == "t":
             share = np.full(len(q), time)

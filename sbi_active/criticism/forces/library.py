@@ -15,7 +15,7 @@ from torch.distributions import Distribution, Independent, Normal
 from sbi_active.arrays import Array
 from sbi_active.criticism.data.trials import Trials
 from sbi_active.criticism.effects.augmented import AugmentedSimulator
-from sbi_active.criticism.effects.effect import Context, Effect, UnderKey
+from sbi_active.criticism.effects.effect import Effect, UnderKey
 from sbi_active.criticism.effects.table import picked
 from sbi_active.criticism.forces.dictionary import (
     FORMS,
@@ -25,6 +25,7 @@ from sbi_active.criticism.forces.dictionary import (
     Joint,
 )
 from sbi_active.criticism.rivals.trial_simulator import TrialSimulator
+from sbi_active.expected import require
 from sbi_active.seeding import forked_generators
 from sbi_active.simulation import SimulatorModel
 
@@ -110,7 +111,8 @@ def force_effects(
         )
     nominal = trajectories(simulator, prior, trials, seed=seed)
     known = _joints(simulator, nominal, joints, slides)
-    order = _range_of(trials.index)
+    low, high = float(trials.index.min()), float(trials.index.max())
+    order = 0.5 * (low + high), max(0.5 * (high - low), 0.5)
     found: list[Effect] = []
     for joint in known:
         scale = 0.2 * nominal.force[joint.dof]  # a prior deviation
@@ -173,33 +175,23 @@ def _effect(
     )
 
 
-def _range_of(index: Tensor) -> tuple[float, float]:
-    low, high = float(index.min()), float(index.max())
-    return 0.5 * (low + high), max(0.5 * (high - low), 0.5)
-
-
 def _joints(
     simulator: SimulatorModel,
     nominal: Trajectories,
     names: Sequence[str] | None,
     slides: Sequence[str],
 ) -> list[Joint]:
-    num = nominal.v.shape[2]
-    if nominal.q.shape[2] != num:
-        raise ValueError(
-            f"expected a position for each velocity; got {nominal.q.shape[2]} and "
-            f"{num}; leave free and ball joints out of what forces see"
-        )
-    own = getattr(simulator.fn, "joints", None)
-    if names is None and own is not None:
-        names, slides = own
+    num, got = nominal.v.shape[2], f"{nominal.q.shape[2]} and {nominal.v.shape[2]}"
+    advice = "leave free and ball joints out of what forces see"
+    same = nominal.q.shape[2] == num
+    require(same, "a position for each velocity", got, advice)
     if names is None:
-        names = [f"joint {k + 1}" for k in range(num)]
-    if len(names) != num:
-        raise ValueError(
-            f"expected {num} names of joints; got {', '.join(names)}; name each degree "
-            "of freedom in the order of v"
-        )
+        own: Any = getattr(simulator.fn, "joints", None)
+        names, slides = own or ([f"joint {k + 1}" for k in range(num)], slides)
+    assert names is not None
+    advice = "name each degree of freedom in the order of v"
+    same, got = len(names) == num, ", ".join(names)
+    require(same, f"{num} names of joints", got, advice)
     found = []
     for k, name in enumerate(names):
         q, v = nominal.q[..., k], nominal.v[..., k]
@@ -250,11 +242,6 @@ class _Recorder:
             force[:, self.dof] = PUSH * phi[:, 0]
         return force
 
-    def read(self) -> tuple[Array, Array, Array]:
-        times = sorted(self.seen)
-        q, v = zip(*[self.seen[t] for t in times], strict=True)
-        return np.array(times), np.stack(q, 1), np.stack(v, 1)
-
 
 def trajectories(
     model: SimulatorModel, prior: Distribution, trials: Trials, *, seed: int = 0
@@ -292,21 +279,14 @@ def trajectories(
 def _recorded(
     model: SimulatorModel, trials: Trials, theta: Tensor, dof: int | None
 ) -> tuple[Array, Array, Array]:
-    recorder = _Recorder(dof)
-
-    def apply(value: Any, phi: Tensor, action: Tensor, context: Context) -> Any:
-        return {**value, "force": {recorder: phi}}
-
-    one = Independent(Normal(torch.zeros(1), torch.ones(1)), 1)
-    effect = Effect("recorder", hook="dynamics", prior=one, null=0.0, apply=apply)
-    simulator = TrialSimulator(
-        AugmentedSimulator(model, [effect], next_index=int(trials.index.max()) + 1),
-        trials,
-    )
+    recorder, prior = _Recorder(dof), Normal(torch.zeros(1), torch.ones(1))
+    applied = {"null": 0.0, "apply": UnderKey("force", recorder)}
+    effect = Effect("recorder", hook="dynamics", prior=prior, **applied)
+    simulator = TrialSimulator(AugmentedSimulator(model, [effect]), trials)
     simulator.predict(theta, {"recorder": torch.ones(len(theta), 1)})
-    if not recorder.seen:
-        raise ValueError(
-            "expected a simulator that adds generalized forces; got one that never "
-            "asked for them; call total_force(force, q, v, t) in each of its steps"
-        )
-    return recorder.read()
+    expected, got = "a simulator that adds generalized forces", "one that never asks"
+    advice = "call total_force(force, q, v, t) in each of its steps"
+    require(bool(recorder.seen), expected, got, advice)
+    times = sorted(recorder.seen)
+    q, v = zip(*[recorder.seen[t] for t in times], strict=True)
+    return np.array(times), np.stack(q, 1), np.stack(v, 1)

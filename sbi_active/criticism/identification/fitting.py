@@ -36,6 +36,7 @@ from sbi_active.criticism.results import ModelKey
 from sbi_active.criticism.rivals.error_models import NoiseCell, NoiseGrid
 from sbi_active.criticism.rivals.rival import Rival
 from sbi_active.criticism.rivals.trial_simulator import TrialSimulator
+from sbi_active.expected import require
 from sbi_active.inference.sampling.least_squares import basis_of
 from sbi_active.simulation import SimulatorModel
 
@@ -162,7 +163,6 @@ def fitted(
     prior: Distribution,
     trials: Trials,
     beside: Sequence[Effect],
-    *,
     known_sd: Array | None,
     seed: int,
     settings: IdentifySettings,
@@ -251,18 +251,13 @@ def _bare(
     augmented = AugmentedSimulator(model, beside, next_index=index)
     simulator = TrialSimulator(augmented, trials, seed=seed)
     m = simulator.measurements
-    if not m.has_time or not len(m):
-        raise ValueError(
-            "expected trajectories with sample times; got outcomes without a time "
-            "axis, or none; give sample_times to the simulator or the trials, or use "
-            "Campaign"
-        )
+    expected, got = "trajectories with sample times", "outcomes without a time axis"
+    advice = "give sample_times to the simulator or the trials, or use Campaign"
+    require(m.has_time and len(m) > 0, expected, f"{got}, or none", advice)
     num = int(np.prod(trials.x.shape[2:]))
-    if lost := [c for c in range(num) if not (m.channel == c).any()]:
-        raise ValueError(
-            f"expected some measured numbers in every channel; got none in channel "
-            f"{lost[0]}; leave it out of x"
-        )
+    lost = [c for c in range(num) if not (m.channel == c).any()]
+    expected, got = "measured numbers in every channel", f"none in channels {lost}"
+    require(not lost, expected, got, "leave them out of x")
     spread = [max(m.x[m.channel == c].std(), TINY) for c in range(num)]
     scale = np.array(spread)[m.channel]
     return Rival(

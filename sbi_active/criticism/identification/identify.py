@@ -23,7 +23,7 @@ from sbi_active.criticism.identification.widening import (
     shared,
     spread,
 )
-from sbi_active.expected import suggests
+from sbi_active.expected import require, suggests
 from sbi_active.inference.beliefs.diagnostics import Diagnostics
 from sbi_active.inference.beliefs.weighted import KernelBelief
 from sbi_active.inference.sampling.weights import scott
@@ -60,18 +60,14 @@ class IdentifiedBelief(KernelBelief):
         Args:
             level: Probability of the interval.
         """
-        if not 0 < level < 1:
-            raise ValueError(
-                f"expected a level between 0 and 1; got {level}; pass a probability"
-            )
+        require(0 < level < 1, "a level between 0 and 1", level, "pass a probability")
         assert self.parameter_names is not None
-        draws, found = self.draws.double().numpy(), {}
-        each = zip(self.parameter_names, self.sides.tolist(), draws.T, strict=True)
-        for name, side, own in each:
-            below = (1 - level) * (1 + side) / 2
-            low, high = np.quantile(own, [below, below + level]).tolist()
-            found[name] = low, high
-        return found
+        below, draws = (1 - level) * (1 + self.sides) / 2, self.draws.double().numpy()
+        ends = [
+            np.quantile(own, [low, low + level]).tolist()
+            for own, low in zip(draws.T, below, strict=True)
+        ]
+        return dict(zip(self.parameter_names, map(tuple, ends), strict=True))
 
 
 @suggests
@@ -132,14 +128,10 @@ def identify(
         {'theta_1': 0.8}
     """
     model, known_sd = _with_noise(model, prior, trials)
-    some = trials.fit
+    some, own, seed = trials.fit, settings, derive_seed(seed, "identify")
     if int(some.valid.sum()) > 1:  # a single log is as good, if it is long
         require_fitting(model, prior, trials, (), None)
-    seed = derive_seed(seed, "identify")
-    own = settings
-    found = fitted(
-        *(model, prior, some, beside), known_sd=known_sd, seed=seed, settings=own
-    )
+    found = fitted(model, prior, some, beside, known_sd, seed, own)
     rng = np.random.default_rng(derive_seed(seed, "draws"))
     u, effective, shape = _sampled(found, rng, own)
     parts, c = spread(found, own.fewest_parts), found.rival.coordinates
@@ -148,7 +140,8 @@ def identify(
     least = float(parts.p_value.min(initial=1.0))
     disagree = least * len(parts.p_value) < own.level
     if disagree:
-        u = reflected(parts.widen(u, own.wider, rng), low, high)
+        weight = own.wider * rng.standard_normal((len(u), len(parts.deviation)))
+        u = reflected(u + weight @ parts.deviation, low, high)
     ratio, alike = shared(found)
     if alike < own.level:
         extra = rng.permutation(found.draws.u[:, : u.shape[1]])
@@ -213,24 +206,19 @@ def _with_noise(
     noise = model.noise
     num = int(np.prod(trials.x.shape[2:]))
     if noise is None:
-        if not lacks_noise(model, prior, trials):
-            raise ValueError(
-                "expected a deterministic simulator; got a random one; use Campaign, "
-                "which learns what it returns, or fix its seed and declare noise="
-            )
+        is_mean = lacks_noise(model, prior, trials)
+        advice = "use Campaign, which learns what it returns, or declare noise="
+        require(is_mean, "a deterministic simulator", "a random one", advice)
         model = copy.copy(model)
         model.noise = GaussianNoise(1.0)
         return model, None
     if not isinstance(noise, GaussianNoise) or noise.posterior is not None:
         return model, None
     sd = np.broadcast_to(np.asarray(noise.sd, dtype=float).reshape(-1), (num,))
-    if not (sd > 0).all():  # errors are told in its units
-        got = ", ".join(f"{value:g}" for value in sd)
-        raise ValueError(
-            f"expected an error above 0 in each channel; got {got}; declare the "
-            "sensor's standard deviation, or pass a model without noise, whose size "
-            "is then found with the rest"
-        )
+    got = ", ".join(f"{value:g}" for value in sd)  # errors are told in its units
+    advice = "declare the sensor's standard deviation, or pass a model without noise, "
+    advice += "whose size is then found with the rest"
+    require(bool((sd > 0).all()), "an error above 0 in each channel", got, advice)
     return model, sd
 
 
@@ -273,30 +261,24 @@ def _beyond(
     found: Fitted, errors: dict[str, dict[str, float]], declared: Array, times: float
 ) -> list[str]:
     """Return in which channels residuals are far larger than the declared error."""
-    notes = []
-    for c, (name, own) in enumerate(errors.items()):
-        if own["sd"] <= times * declared[c]:
-            continue
-        # What is left, since shapes of the error only have sizes some steps apart.
-        ratio = found.sizes[c] / declared[c]
-        notes.append(
-            f"SA124 residuals of {name} are {ratio:.2g} times the declared error: the "
-            "model lacks something, or the error is declared too small; ask "
-            "close_loop what it lacks"
-        )
-    return notes
+    # What is left, since shapes of the error only have sizes some steps apart.
+    ratio = found.sizes / declared
+    return [
+        f"SA124 residuals of {name} are {ratio[c]:.2g} times the declared error: the "
+        "model lacks something, or the error is declared too small; ask close_loop "
+        "what it lacks"
+        for c, (name, own) in enumerate(errors.items())
+        if own["sd"] > times * declared[c]
+    ]
 
 
 def _at_bounds(belief: IdentifiedBelief) -> list[str]:
     """Return the parameters that may be beyond a bound of the prior."""
-    notes, found = [], belief.interval()
-    for (name, (low, high)), side in zip(found.items(), belief.sides, strict=True):
-        if side:
-            limit = f"upper one: at least {low:.3g}"
-            if side < 0:
-                limit = f"lower one: at most {high:.3g}"
-            notes.append(
-                f"SA103 {name} is at a bound of its prior, the {limit}, and nothing "
-                "says how far beyond; move the bound, or say why"
-            )
-    return notes
+    limits = {-1: "lower one: at most {1:.3g}", 1: "upper one: at least {0:.3g}"}
+    each = zip(belief.interval().items(), belief.sides.tolist(), strict=True)
+    return [
+        f"SA103 {name} is at a bound of its prior, the {limits[side].format(*ends)}, "
+        "and nothing says how far beyond; move the bound, or say why"
+        for (name, ends), side in each
+        if side
+    ]

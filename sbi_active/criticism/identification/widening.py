@@ -7,7 +7,7 @@ and beside bounds of the prior.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any, cast
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -94,8 +94,7 @@ def sampled(
     return infer(rival, rng, found=found, settings=settings)
 
 
-@dataclass(frozen=True)
-class Spread:
+class Spread(NamedTuple):
     """The disagreement between parts of the trials.
 
     Attributes:
@@ -110,11 +109,6 @@ class Spread:
     p_value: Array
     deviation: Array
     sd: Array
-
-    def widen(self, u: Array, by: float, rng: np.random.Generator) -> Array:
-        """Return draws (n, d) as far off as the parts are from each other, times by."""
-        weight = rng.standard_normal((len(u), len(self.deviation)))
-        return u + by * weight @ self.deviation
 
 
 def spread(found: Fitted, fewest: int) -> Spread:

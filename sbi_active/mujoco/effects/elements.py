@@ -71,7 +71,8 @@ class Element:
                 hook = "input" if apply.inputs else "observation"
             else:
                 apply = UnderKey("model", apply)
-            found.append(row.made(hook, apply, self.label, self.sizes, self.words))
+            how = {"hook": hook, "apply": apply}
+            found.append(row.made(self.label, self.sizes, self.words, **how))
         return found
 
 

@@ -9,6 +9,7 @@ from torch.distributions import HalfNormal, LogNormal, Normal, Uniform
 from sbi_active import Campaign, DiscreteActions, SimulatorModel
 from sbi_active.criticism import (
     AugmentedSimulator,
+    Context,
     Criticism,
     Trials,
     generic_effects,
@@ -30,7 +31,7 @@ def loop(*effects, model=MODEL):
 
 #: Parts that are none, and what is said of them.
 NO_PARTS = [
-    ({"null": NAN}, "expected a null of effect 'bias'; got NaN"),
+    ({"null": NAN}, "expected a null of effect 'bias' .*; got nan"),
     ({"null": [0.0, 0.0]}, r"expected a null of effect 'bias' of shape \(1,\)"),
     ({"prior": 1.0}, "expected a continuous torch prior of effect 'bias'"),
     ({"prior": LogNormal(0.0, 200.0)}, "expected finite draws .*; got NaN or inf"),
@@ -158,8 +159,9 @@ def test_apply_may_change_what_it_gets(hook):
         model = AugmentedSimulator(
             MODEL, [effect(hook=hook, prior=prior, apply=apply), second]
         )
-        x[apply] = model.evaluate(given[0], phi, given[1], index=given[2])
-        scale = model.noise_scale(phi, given[1], torch.ones(4, 1), index=given[2])
+        context = Context(given[2])
+        x[apply] = model.evaluate(given[0], phi, given[1], context=context)
+        scale = model.noise_scale(phi, given[1], torch.ones(4, 1), context=context)
         assert float(scale[0, 0]) == pytest.approx(1.3 if hook == "noise" else 1.0)
     assert torch.equal(*x.values())
     assert [float(v[0]) for v in given] == pytest.approx([0.5, 2.0, 1.0])

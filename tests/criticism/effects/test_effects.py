@@ -108,7 +108,7 @@ def test_the_index_of_a_plain_call_is_the_next_trial():
     x = model.mean(torch.tensor([[0.0, 0.0, 0.5]]), torch.zeros(1, 1))
     assert x.item() == pytest.approx(4.0)
     given = torch.zeros(3, 2), {"drift": torch.ones(3, 1)}, torch.zeros(3, 1)
-    rows = model.evaluate(*given, index=torch.tensor([0.0, 1.0, 5.0]))
+    rows = model.evaluate(*given, context=Context(torch.tensor([0.0, 1.0, 5.0])))
     assert rows[:, 0].tolist() == [0.0, 1.0, 5.0]
 
 
