@@ -161,10 +161,10 @@ class States:
         return self._aside[own.model.key]
 
     def _set_aside(self, own: Candidate) -> Candidate:
-        """Return a model linearized at its fit without a trial, or as it is.
+        """Return a model linearized at its fit without a trial.
 
-        Which of them explains the trials best is chosen. The trial that the linear
-        model holds to be the one is set aside, and that which errs most.
+        The trial that the linear model holds to be the one is set aside, or that which
+        errs most, whichever explains the trials better.
 
         Args:
             own: The model at its fit to all trials.
@@ -175,7 +175,7 @@ class States:
         every, found = np.ones(errors.num_folds, bool), []
         suspects = self._suspects(own)
         others = (self.search.without(own.model, t, bare) for t in suspects)
-        for c in (own, *others):
+        for c in others:
             gram, log_p = errors.hypotheses(c.model, c.grams, every, OUTLIER)
             found.append((summed(gram, log_p, c.model).log_evidence, c))
         return max(found, key=lambda pair: pair[0])[1]
