@@ -151,7 +151,7 @@ def search(
             starts = np.concatenate([start_at(near), starts])
         if believed is not None and len(looked) == 2:
             likely = start_at(believed)
-            best = np.argsort(_cost(problem, likely, whiten))[: own.num_kept]
+            best = np.argsort(_cost(problem, likely, whiten)[0])[: own.num_kept]
             starts = np.concatenate([likely[best], starts])
         num += len(starts)
         ends, _ = descend(problem, starts, whiten, problem.step, own.iterations)
@@ -199,11 +199,11 @@ def laplace_precision(
     return np.einsum("nij,nik->njk", jac, jac) + np.diag(floored(problem)), jac
 
 
-def _cost(problem: Potential, u: Array, whiten: Whitener) -> Array:
-    """Return sums of squares with that of the prior, shape (n,)."""
-    c = problem.coordinates
+def _cost(problem: Potential, u: Array, whiten: Whitener) -> tuple[Array, Array]:
+    """Return sums of squares with that of the prior, (n,), and residuals, (n, N)."""
+    c, residual = problem.coordinates, whiten(problem.residual(u)[0])
     prior = ((u - c.center) ** 2 * c.precision).sum(1)
-    return (whiten(problem.residual(u)[0]) ** 2).sum(1) + prior
+    return (residual**2).sum(1) + prior, residual
 
 
 def _promising(
@@ -218,7 +218,7 @@ def _promising(
     References:
         Rinnooy Kan & Timmer, Mathematical Programming 39 (1987).
     """
-    own, cost = settings, _cost(problem, u, whiten)
+    own, (cost, residual) = settings, _cost(problem, u, whiten)
     best, num = np.argsort(cost), own.num_starts
     num_odd, num_around = int(own.share_odd * num), own.num_around * (problem.dim + 1)
     if num_around >= len(u):
@@ -227,7 +227,7 @@ def _promising(
     np.fill_diagonal(apart, np.inf)
     around = np.argpartition(apart, num_around, axis=1)[:, :num_around]
     better = (cost < cost[around].min(1))[best]
-    odd = oddity(u, whiten(problem.residual(u)[0]), around)
+    odd = oddity(u, residual, around)
     rows = [*dict.fromkeys([*best[better][:num_odd], *best])][: num - num_odd]
     return [*dict.fromkeys([*rows, *np.argsort(-odd)])][:num]
 
@@ -266,8 +266,8 @@ def oddity(
         miss = weight @ (near @ np.swapaxes(weight, 1, 2))
         miss = miss[:, 0, 0] + product[rows, rows]
         miss -= 2 * (weight[:, 0] * product[rows[:, None], own]).sum(1)
-        left = near - x @ (plane @ near)
-        left = np.maximum(np.trace(left, axis1=1, axis2=2), 0.0) / (k - d - 1)
+        left = np.trace(near, axis1=1, axis2=2) - (across * (plane @ near)).sum((1, 2))
+        left = np.maximum(left, 0.0) / (k - d - 1)
         parts.append(miss / (1 + (weight**2).sum((1, 2))) / (1 + left))
     return np.concatenate(parts)
 
@@ -284,10 +284,10 @@ def _settled(
 
     A place is far from a fit if its mean square exceeds ``far``.
     """
-    own, u, cost, stalls = settings, u.copy(), _cost(problem, u, whiten), 0
+    own, u, cost, stalls = settings, u.copy(), _cost(problem, u, whiten)[0], 0
     for _ in range(own.phases):
         whiten = problem.whitener(u[[cost.argmin()]])
-        cost = _cost(problem, u, whiten)  # where all is simulated already
+        cost, _ = _cost(problem, u, whiten)  # where all is simulated already
         before, rows = cost.min(), _distinct(u, cost)[: own.num_kept]
         u[rows], cost[rows] = descend(problem, u[rows], whiten, problem.step, own.later)
         stalls = stalls + 1 if before - cost.min() < own.progress else 0
