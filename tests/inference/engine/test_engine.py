@@ -18,6 +18,7 @@ from sbi_active.inference.engine import surface as surfaces
 from sbi_active.inference.engine.importance import pareto_shape
 from sbi_active.inference.engine.learned import learned_fit
 from sbi_active.inference.engine.pool import Pool, PriorDraws
+from sbi_active.inference.engine.search import oddity
 from sbi_active.inference.engine.settings import Settings, SurfaceSettings
 from sbi_active.inference.sampling.coordinates import PriorCoordinates
 from sbi_active.inference.sampling.least_squares import descend
@@ -146,6 +147,62 @@ def test_a_mode_that_draws_miss_is_told_by_those_of_other_proposals(width, misse
         drawn = drawn_from.sample(4_000, rng)
         pool.add(drawn_from, drawn, given, is_final=place == 1)
     assert pool.missed == pytest.approx(missed, abs=0.1)
+
+
+# A narrow mode beside a wide one
+
+
+def bumped(dim: int, width: float) -> Given:
+    """A straight response, and a bump that carries it from -1 to 0.7 in each."""
+    at, sd = np.full(dim, -1.0), 0.1
+
+    def residual(u):
+        bump = np.exp(-0.5 * ((u - at) ** 2).sum(1, keepdims=True) / width**2)
+        # The last number is the wide mode's misfit of two deviations.
+        off = np.concatenate([u - 0.7 + 1.7 * bump, 0.2 * (1 - bump)], axis=1)
+        return off / sd
+
+    return Given(residual, dim, dim + 1, sd=sd)
+
+
+def masses(own: Given, *, near: float, num: int = 401) -> tuple[float, float]:
+    """Return log integrals around the bump and of all else, by quadrature.
+
+    Without the bump the residuals are straight, and what is around it negligible.
+    """
+    axis = np.linspace(-1 - near, -1 + near, num)
+    u = np.stack(np.meshgrid(*[axis] * own.dim), axis=-1).reshape(-1, own.dim)
+    narrow = logsumexp(own.log_prior(u) + own.log_likelihood(u))
+    narrow += own.dim * np.log(axis[1] - axis[0])
+    wide = own.dim * norm.logpdf(0.7, scale=np.hypot(1, own.sd))
+    return float(narrow), wide + norm.logpdf(0.2, scale=own.sd)
+
+
+@pytest.mark.parametrize("seed", [2, 3, 4])
+@pytest.mark.parametrize(("dim", "width"), [(1, 0.03), (2, 0.2)])
+def test_a_narrow_mode_beside_a_wide_one_is_found(dim, width, seed):
+    """It was lost where the best draws of the prior were all in the wide one."""
+    own, rng = bumped(dim, width), np.random.default_rng(seed)
+    found = infer(own, rng, found=search(own, rng))
+    narrow, wide = masses(own, near=5 * width)
+    share = 1 / (1 + np.exp(wide - narrow))
+    assert 0.3 < share < 0.7
+    error = 4 * found.standard_error
+    assert found.log_evidence == pytest.approx(np.logaddexp(narrow, wide), abs=error)
+    is_narrow = (found.u < -0.3).all(1)
+    assert found.weight[is_narrow].sum() == pytest.approx(share, abs=0.1)
+
+
+def test_a_draw_is_odd_where_others_do_not_predict_it():
+    rng = np.random.default_rng(0)
+    u = rng.standard_normal((100, 2))
+    around = np.argsort(((u[:, None] - u) ** 2).sum(-1), axis=1)[:, 1:10]
+    residual = np.concatenate([1e3 * u, 50 * u[:, :1] ** 2], axis=1)
+    residual[7] += 200.0  # less than the response between neighbors
+    assert oddity(u, residual, around).argmax() == 7
+    residual[7] -= 200.0
+    flat = oddity(u, 1e3 * u, around)
+    assert flat == pytest.approx(np.zeros(100), abs=1e-3)
 
 
 # The posterior of a learned likelihood, on densities with known normalizers
