@@ -18,7 +18,7 @@ What plain least squares of the same run found stands in ``go2.md``.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -26,20 +26,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.criticism.problem import counted
-from benchmarks.measured.go2_leg import (
-    DATA,
-    LEGS,
-    Leg,
-    read_leg,
-    usual_parameters,
-)
+from benchmarks.measured.go2_leg import DATA, LEGS, Leg, read_leg, usual_parameters
 from benchmarks.measured.record_stages import center, row_of
 from benchmarks.rows import add, measured, stages
 from benchmarks.table import shown
-from sbi_active.criticism import Criticism, Effect
+from sbi_active.criticism import Criticism
 from sbi_active.criticism.results import ModelKey
 from sbi_active.mujoco import mjcf_effects
-from sbi_active.mujoco.robot import Robot
 
 Array = NDArray[np.float64]
 RESULT = Path(__file__).parent / "results" / "go2.json"
@@ -51,17 +44,25 @@ KINDS += ("zero offset", "sensor bias", "sensor delay")
 FEW_KINDS = ("friction loss by *", "static friction")
 
 
-def judge(leg: Leg, library: Callable[[Robot], Sequence[Effect]]) -> dict[str, Any]:
-    """Return the row of one verdict.
+def judge(leg: Leg, removed: Sequence[str] = (), *, few: bool) -> dict[str, Any]:
+    """Return the row of one verdict on the knee of the engineer's model.
+
+    That has the torque scale of the motor already, "gain" by another name. What moves
+    the body behind the joint by a second one is left out for what it costs.
 
     Args:
         leg: Leg that is fitted.
-        library: Function from a robot to the effects that are declared.
+        removed: Names of effects that are not declared.
+        few: Whether only what was near on the first leg is.
     """
     parameters = usual_parameters(leg)
     robot = leg.robot(parameters, leg.triangles())
     begin = time.process_time()
-    effects = [*library(robot)]
+    joint, motor = leg.joints[-1], leg.motors[-1]
+    kinds = FEW_KINDS if few else KINDS
+    wanted = [*(f"{joint} {kind}" for kind in kinds), f"{motor} delay"]
+    wanted += [] if few else [f"{motor} bias", "gravity tilt *"]
+    effects = mjcf_effects(robot, include=wanted, exclude=removed)
     model, count = counted(robot.simulator)
     assert robot.trials is not None
     # The report's residuals, each trial predicted from those before, would take as
@@ -91,32 +92,10 @@ def main(*, data: Path = DATA) -> None:
     """
     every, rows = [measured(read_leg, data, name) for name in LEGS], stages(RESULT)
     for leg in every:
-        for name, row in _stages(leg, rows):
-            add(RESULT, rows, name, row)
+        if leg.name not in rows:
+            add(RESULT, rows, leg.name, judge(leg, few=leg.name != LEGS[0]))
+        if (name := f"{leg.name}, removed") not in rows:
+            helps = rows[leg.name]["helps"]
+            add(RESULT, rows, name, judge(leg, helps, few=True))
     figures = ("verdict", "helps", "support", "before", "after", "parameters")
     print(shown(RESULT, *(f"*, {name}*" for name in figures), "*cpu_seconds"))
-
-
-def _library(
-    leg: Leg, removed: Sequence[str] = (), *, few: bool = False
-) -> Callable[..., list[Effect]]:
-    """Return what lists the effects on the knee of the engineer's model.
-
-    That has the torque scale of the motor already, "gain" by another name. What moves
-    the body behind the joint by a second one is left out for what it costs.
-    """
-    joint, motor = leg.joints[-1], leg.motors[-1]
-    kinds = FEW_KINDS if few else KINDS
-    wanted = [*(f"{joint} {kind}" for kind in kinds), f"{motor} delay"]
-    wanted += [] if few else [f"{motor} bias", "gravity tilt *"]
-    return lambda robot: mjcf_effects(robot, include=wanted, exclude=removed)
-
-
-def _stages(leg: Leg, rows: dict[str, Any]) -> Iterator[tuple[str, Any]]:
-    """Yield the name and the row of each stage that is missing."""
-    own = leg.name
-    if own not in rows:
-        yield own, judge(leg, _library(leg, few=own != LEGS[0]))
-    helps = rows[own]["helps"]
-    if (name := f"{own}, removed") not in rows:
-        yield name, judge(leg, _library(leg, helps, few=True))

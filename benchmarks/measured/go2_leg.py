@@ -118,7 +118,7 @@ class Leg:
             log[motor] = self.goal[rows, k]
             read = np.arange(end - begin) % every == 0
             log[joint] = np.where(read, self.position[rows, k], np.nan)
-            log[f"start {joint}"] = self.position[rows, k]
+            log[f"start {joint}"] = np.full(end - begin, self.position[begin, k])
             log[f"start {joint} velocity"] = np.full(end - begin, slopes[k])
         return log
 

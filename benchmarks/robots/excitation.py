@@ -12,17 +12,19 @@ half of the prior, encoders with white noise of 1 mrad at 50 Hz.
 *Chirps* are those of common practice: every joint sweeps from 0.1 to 10 Hz in 20 s, all
 at once, three times over (60 s), with the largest amplitude that keeps the limits of
 position, speed and torque at parameters of the prior.
-*Chosen*: signals of 2.4, 8.7 and 8.7 s, one after the other: what the first tells is
-enough for the limits to permit larger ones. Each is the best of some 150 by the
-Gauss-Newton information under the belief of that time, the first under the prior: 100
-random ones (a chirp or a multisine for each joint, about centers of their own) and 52
-plain ones, in which all joints do the same in one of 13 bands; with the drives' gains
-as they are or a quarter of that, and as large as the same limits permit. Asked for are
-the parameters whose deviations are not yet at most those of the chirps.
-*Random* takes the first of such a pool in a random order. Four draws of the belief say
-what the limits permit; the signal that is played is made smaller until it keeps them,
-less a margin of 3 %, at 1,000 draws. Every belief is that of ``identify`` from the
-simulated recordings.
+*Chosen*: signals of 2.4, 5.8, 5.8 and 5.8 s, one after the other: what the first tells
+is enough for the limits to permit larger ones. Each is one of some 150: 100 random ones
+(a chirp or a multisine for each joint, about centers of their own) and 52 plain ones,
+in which all joints do the same in one of 13 bands; with the drives' gains as they are
+or a quarter of that, and as large as the same limits permit. The first is the one that
+tells most under the prior, by the Gauss-Newton information. Since every deviation is
+to be at most that of the chirps, the others are those by which the largest, in units
+of the chirps', is predicted to come down most: under the belief of the time, and if
+the best other of the pool is played in all the time that is left.
+*Random*: of 2.4, 8.7 and 8.7 s, each the first of such a pool in a random order. Four
+draws of the belief say what the limits permit; the signal that is played is made
+smaller until it keeps them, less a margin of 3 %, at 1,000 draws. Every belief is that
+of ``identify`` from the simulated recordings.
 
 Recorded: standard deviations of all parameters after each, whether 90 % intervals
 cover, and whether all signals so far kept the limits at 1,000 other draws of the
@@ -46,7 +48,7 @@ from torch import Tensor
 
 from benchmarks.robots.machines import go2_leg
 from benchmarks.robots.models import ARM
-from benchmarks.robots.signals import SHARE, Played, largest, plain
+from benchmarks.robots.signals import FACTORS, SHARE, Played, largest, plain, scaled
 from benchmarks.rows import benchmark, column, grouped
 from sbi_active import DiscreteActions, InformationGainDesigner
 from sbi_active.actions import SignalActions
@@ -60,8 +62,9 @@ from sbi_active.seeding import derive_seed, forked_generators, row_seeds
 RESULT = Path(__file__).parent / "results" / "excitation.csv"
 
 NOISE, RATE, GRID = 0.001, 50.0, 200.0  # rad; Hz of encoders and of goals
-SWEEP, SWEEPS, LENGTHS = 20.0, 3, (2.4, 8.7, 8.7)  # s
-NUM_DRAWN, NUM_SAMPLES = 100, 64
+SWEEP, SWEEPS = 20.0, 3  # s
+LENGTHS = {"chosen": (2.4, 5.8, 5.8, 5.8), "random": (2.4, 8.7, 8.7)}  # s
+NUM_DRAWN, NUM_SAMPLES, NUM_PLANE = 100, 64, 16
 FEW, MANY, MARGIN = 4, 1_000, 0.97  # draws that a pool and a signal have to keep
 SOFT = 0.25  # of a drive's stiffness, in the second model
 LEVEL = 0.9
@@ -186,7 +189,9 @@ def safe(name: str, robot: Robot, belief: Any, action: Tensor) -> tuple[Tensor, 
         it keeps the limits at as many other draws.
     """
     permitted = limits_of(name, robot, belief, share=MARGIN, num_draws=MANY)
-    action = largest(action, permitted)
+    # Few draws permitted this size: what many permit is near it, so from there down.
+    sizes = (scaled(action, torch.tensor([k])) for k in range(len(FACTORS)))
+    action = next(own for own in sizes if permitted(own))
     other = limits_of(name, robot, belief, num_draws=MANY, seed=1)
     return action, bool(other(action).all())
 
@@ -210,6 +215,40 @@ def permitted_pool(name: str, robot: Robot, belief: Any, seed: int) -> Tensor:
         return pool[torch.randperm(len(pool))]
 
 
+def nearest(
+    robot: Robot, belief: Any, pool: Tensor, wanted: Tensor, num_left: int
+) -> Tensor:
+    """Return the signal by which all deviations come nearest to those wanted.
+
+    What a signal tells is the Gauss-Newton information of a plane through outcomes at
+    draws of the belief.
+
+    Args:
+        robot: Robot that plays the signals.
+        belief: Belief of the time.
+        pool: Signals, shape (n, action_dim).
+        wanted: Standard deviations, shape (theta_dim,).
+        num_left: Number of signals still to come, this one included.
+
+    Returns:
+        The one after which, and after the best other in all signals that then follow,
+        the largest deviation in units of that wanted is least, shape (1, action_dim).
+    """
+    theta, simulator = belief.quick_sample(NUM_PLANE, seed=0), robot.simulator
+    assert simulator.noise is not None
+    unit = ((theta - theta.mean(0)) / wanted).double()
+    known = torch.cov((belief.draws / wanted).double().T).inverse()
+    told = torch.empty(len(pool), *known.shape, dtype=torch.float64)
+    for k, own in enumerate(pool.split(1)):
+        mean = simulator.mean(theta, own.expand(len(theta), -1)).double()
+        y = simulator.noise.whiten(mean).flatten(1)
+        slope = torch.linalg.lstsq(unit, y).solution
+        told[k] = slope @ slope.T
+    all_told = known + told + (num_left - 1) * told[:, None]
+    variance = torch.linalg.inv(all_told).diagonal(dim1=-2, dim2=-1)
+    return pool[variance.amax(-1).amin(0).argmin()][None]
+
+
 def recorded(parts: Sequence[tuple[Any, Tensor]], theta: Tensor, seed: int) -> Trials:
     """Return trials of simulated robots, each of which played some actions."""
     each = enumerate(len(action) for _, action in parts)
@@ -231,7 +270,7 @@ def recorded(parts: Sequence[tuple[Any, Tensor]], theta: Tensor, seed: int) -> T
 
 def score(name: str, case: int) -> list[dict[str, object]]:
     """Return a row for the chirps, the chosen and the random signals."""
-    robot = robot_of(name, max(LENGTHS))
+    robot = robot_of(name, LENGTHS["chosen"][-1])
     with forked_generators(case, "truth"):
         low, high = robot.prior.base_dist.low, robot.prior.base_dist.high
         theta = low + (high - low) * (0.25 + 0.5 * torch.rand(1, len(low)))
@@ -255,28 +294,30 @@ def score(name: str, case: int) -> list[dict[str, object]]:
     own = recorded([(sweeps, chirps(name).repeat(SWEEPS, 1))], theta, case)
     belief = identify(sweeps.simulator, sweeps.prior, own, seed=case)
     keep("chirps", belief, SWEEP * SWEEPS, begin)
-    wanted, names = belief.draws.std(0), np.array(robot.simulator.parameter_names)
-    for arm in ("chosen", "random"):
+    wanted = belief.draws.std(0)
+    for arm, lengths in LENGTHS.items():
         begin, belief = time.process_time(), robot.prior
         parts: list[tuple[Robot, Tensor]] = []
-        left, kept = list[str](), list[bool]()
-        for k, seconds in enumerate(LENGTHS):
+        kept: list[bool] = []
+        for k, seconds in enumerate(lengths):
             played = robot_of(name, seconds)
-            pool = permitted_pool(name, played, belief, derive_seed(case, k))
-            if arm == "chosen":
+            seed = derive_seed(case, k)
+            pool = permitted_pool(name, played, belief, seed)
+            if arm == "chosen" and k:
+                pool = nearest(played, belief, pool, wanted, len(lengths) - k)
+            elif arm == "chosen":
                 designer = InformationGainDesigner(
                     DiscreteActions(pool), num_samples=NUM_SAMPLES, estimator="linear"
                 )
-                asked = {"target": left or "theta", "seed": derive_seed(case, k)}
                 own = played.simulator
-                pool = designer.select(None, own, belief=belief, **asked).action[None]
+                design = designer.select(None, own, belief=belief, seed=seed)
+                pool = design.action[None]
             signal, is_kept = safe(name, played, belief, pool[:1])
             parts.append((played, signal))
             kept.append(is_kept)
             trials = recorded(parts, theta, case)
             belief = identify(robot.simulator, robot.prior, trials, seed=case)
-            keep(arm, belief, sum(LENGTHS[: k + 1]), begin, *kept)
-            left = names[belief.draws.std(0) > wanted].tolist()
+            keep(arm, belief, sum(lengths[: k + 1]), begin, *kept)
     return rows
 
 

@@ -24,7 +24,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -70,27 +69,20 @@ def planned(
         times=times,
         noise=dict(own.read),
     )
-    inputs = {name: [] for name in own.drive}
-    for _ in range(NUM_TRIALS):
-        played = sines(inner, own.drive.values(), rng).T
-        for name, signal in zip(own.drive, played, strict=True):
-            inputs[name].append(signal)
+    played = [sines(inner, own.drive.values(), rng).T for _ in range(NUM_TRIALS)]
     starts = {
         name: center + half * rng.uniform(-1, 1, NUM_TRIALS)
         for name, (center, half) in own.start.items()
     }
-    return robot, partial(
-        _measured,
+    return robot, lambda x: Trials(
+        None,
+        x[..., 0] if x.shape[-1] == 1 else x,
         sample_times=times,
-        inputs={name: np.stack(rows) for name, rows in inputs.items()},
+        inputs=dict(zip(own.drive, np.stack(played, 1), strict=True)),
         input_times=inner,
         start=starts,
         channel_labels=robot.simulator.channel_names,
     )
-
-
-def _measured(x: Array, **options: Any) -> Trials:
-    return Trials(None, x[..., 0] if x.shape[-1] == 1 else x, **options)
 
 
 class Truth:

@@ -89,6 +89,13 @@ def plain(num_joints: int, models: tuple[float, ...] = (0.0, 1.0)) -> Tensor:
     return torch.tensor(found)
 
 
+def scaled(action: Tensor, k: Tensor) -> Tensor:
+    """Return signals (n, action_dim) with the shares times the k-th of ``FACTORS``."""
+    tried = action.clone()
+    tried[:, 1 :: len(ENTRIES)] *= torch.tensor(FACTORS)[k][:, None]
+    return tried
+
+
 def largest(action: Tensor, permitted: Callable[[Tensor], Tensor]) -> Tensor:
     """Return signals as large as the limits permit, without those that never are.
 
@@ -102,20 +109,13 @@ def largest(action: Tensor, permitted: Callable[[Tensor], Tensor]) -> Tensor:
     Returns:
         Shape (m, action_dim), m <= n.
     """
-    factors = torch.tensor(FACTORS)
-
-    def scaled(k: Tensor) -> Tensor:
-        tried = action.clone()
-        tried[:, 1 :: len(ENTRIES)] *= factors[k][:, None]
-        return tried
-
+    num = len(FACTORS)
     first = torch.zeros(len(action), dtype=torch.long)
-    last = torch.full_like(first, len(factors))  # not permitted, or not known to be
+    last = torch.full_like(first, num)  # not permitted, or not known to be
     while bool((first < last).any()):
         middle = (first + last) // 2
-        is_permitted = permitted(scaled(middle.clamp(max=len(factors) - 1)))
+        is_permitted = permitted(scaled(action, middle.clamp(max=num - 1)))
         is_open = first < last
         last = torch.where(is_open & is_permitted, middle, last)
         first = torch.where(is_open & ~is_permitted, middle + 1, first)
-    found = last < len(factors)
-    return scaled(last.clamp(max=len(factors) - 1))[found]
+    return scaled(action, last.clamp(max=num - 1))[last < num]

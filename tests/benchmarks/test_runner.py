@@ -5,6 +5,8 @@ import math
 import re
 from importlib import import_module
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -29,6 +31,7 @@ from benchmarks.robustness import run as robustness
 from benchmarks.rows import benchmark, read
 from benchmarks.search import run as search
 from benchmarks.target import cart_pole as target
+from sbi_active import GaussianNoise, SimulatorModel
 from sbi_active.tasks import cascaded_tanks
 from tests.criticism.misfit.oscillator import EFFECTS, MODEL, PRIOR, trials
 
@@ -240,6 +243,29 @@ def test_an_effect_hidden_in_a_robot_shows_and_no_parameter_absorbs_it():
     # Not refitted, the bare model is farther away.
     apart = truth.run(theta[None], effect, phi) - truth.run(theta[None])
     assert (apart**2).sum() >= excess * 0.999
+
+
+def test_signals_are_chosen_for_the_worst_deviation():
+    """Not the first, which tells most, unless another tells the rest after it."""
+    pytest.importorskip("mujoco")
+    from benchmarks.robots.excitation import nearest
+
+    gain = torch.tensor([[100.0, 1.0], [3.0, 2.0], [1.0, 20.0]])
+    simulator = SimulatorModel(
+        lambda theta, a: theta * gain[a[:, 0].long()], noise=GaussianNoise(1.0)
+    )
+    draws = torch.randn(500, 2, generator=torch.Generator().manual_seed(0))
+    belief = SimpleNamespace(draws=draws, quick_sample=lambda num, seed: draws[:num])
+    robot: Any = SimpleNamespace(simulator=simulator)
+    pool = torch.arange(3.0)[:, None]
+
+    def chosen(num_left, *wanted):
+        return int(nearest(robot, belief, pool, torch.tensor(wanted), num_left))
+
+    # Deviations after one are (.01, .71), (.32, .45) and (.71, .05).
+    assert chosen(1, 1.0, 1.0) == 1
+    assert chosen(2, 1.0, 1.0) in (0, 2)
+    assert chosen(1, 0.1, 10.0) == 0
 
 
 def test_a_test_that_fails_was_not_survived(tmp_path, monkeypatch):
