@@ -10,7 +10,7 @@ beside one of the best single effects, and larger sets grown from the best small
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
@@ -27,7 +27,6 @@ from sbi_active.criticism.linear.fits import (
     missed_by,
     onward,
     polished,
-    refitted,
 )
 from sbi_active.criticism.linear.left_out import Candidate, leave_out
 from sbi_active.criticism.linear.library import Library
@@ -35,11 +34,9 @@ from sbi_active.criticism.linear.mixture import Mixture, beside_process
 from sbi_active.criticism.linear.model import (
     LinearModel,
     at_null,
-    centered,
     chords,
     enlarged,
     has_null,
-    linearize,
 )
 from sbi_active.criticism.results import ModelKey
 from sbi_active.criticism.rivals.residual_process import ResidualProcess
@@ -175,33 +172,6 @@ class Search:
             known = [p for p in key.parts if p in self.found]
             self.keep(self._fit(key, known or [ModelKey()]))
         return self.found[key]
-
-    def without(self, model: LinearModel, trial: int, bare: Array | None) -> Candidate:
-        """Return a model linearized at its best fit to all but one trial.
-
-        Args:
-            model: The model at its fit to all of them.
-            trial: Place of the trial among those with a measurement.
-            bare: Place of the bare model without a trial, shape (d',); None begins at
-                the best draws of the prior.
-        """
-        rival, m = self.rival(model.key), self.errors.measurements
-        kept = m.trial != np.unique(m.trial)[trial]
-        if bare is None:
-            near = self._nearest(rival, kept)
-        else:
-            near = model.u[None].copy()
-            near[:, self.columns(model.key, ModelKey())] = bare
-        u = refitted(rival, model, self.units, kept, [*near])
-        again = centered(rival, linearize(rival, u, self.units), self.units)
-        own = self.found[model.key]
-        return replace(own, model=again, grams=self.errors.grams(again))
-
-    def _nearest(self, rival: Rival, kept: NDArray[np.bool_]) -> Array:
-        """Return the draws of the prior that some numbers are nearest to, (k, d)."""
-        u, some = self.rivals.prior_draws, np.resize(kept, len(self.units))
-        square = ((rival.residual(u)[0] / self.units)[:, some] ** 2).sum(1)
-        return u[np.argsort(square)[: self.settings.num_kept]]
 
     def places(self, key: ModelKey) -> Array:
         """Return a model's best fit and others that may be as good, shape (k, d).

@@ -13,7 +13,7 @@ effect is there is one question, and what its error is like another.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import torch
@@ -22,8 +22,10 @@ from scipy.stats import chi2
 
 from sbi_active.arrays import Array
 from sbi_active.criticism.effects.effect import Effect
+from sbi_active.criticism.linear.fits import refitted
 from sbi_active.criticism.linear.left_out import Candidate
 from sbi_active.criticism.linear.mixture import WIDTHS, Mixture, summed
+from sbi_active.criticism.linear.model import centered, linearize
 from sbi_active.criticism.linear.search import Search
 from sbi_active.criticism.results import OUTLIER, SCATTER, UNEXPLAINED, ModelKey
 from sbi_active.criticism.rivals.rival import (
@@ -169,16 +171,37 @@ class States:
         Args:
             own: The model at its fit to all trials.
         """
-        errors, key, bare = self.search.errors, own.model.key, None
-        if key.effects:
-            bare = self.candidate(ModelKey(error=OUTLIER)).model.u
-        every, found = np.ones(errors.num_folds, bool), []
-        suspects = self._suspects(own)
-        others = (self.search.without(own.model, t, bare) for t in suspects)
-        for c in others:
+        errors, found = self.search.errors, []
+        every = np.ones(errors.num_folds, bool)
+        for trial in self._suspects(own):
+            c = self._without(own, trial)
             gram, log_p = errors.hypotheses(c.model, c.grams, every, OUTLIER)
             found.append((summed(gram, log_p, c.model).log_evidence, c))
         return max(found, key=lambda pair: pair[0])[1]
+
+    def _without(self, own: Candidate, trial: int) -> Candidate:
+        """Return a model linearized at its best fit to all but one trial.
+
+        It begins where the bare model's is, and that at draws of its prior as well.
+
+        Args:
+            own: The model at its fit to all of them.
+            trial: Place of the trial among those with a measurement.
+        """
+        search, key = self.search, own.model.key
+        rival, m, units = search.rival(key), search.errors.measurements, search.units
+        kept = m.trial != np.unique(m.trial)[trial]
+        near = own.model.u[None].copy()
+        if key.effects:
+            bare = self.candidate(ModelKey(error=OUTLIER)).model
+            near[:, search.columns(key, ModelKey())] = bare.u
+        else:
+            u, some = search.rivals.prior_draws, np.resize(kept, len(units))
+            square = ((rival.residual(u)[0] / units)[:, some] ** 2).sum(1)
+            near = u[np.argsort(square)[: search.settings.num_kept]]
+        u = refitted(rival, own.model, units, kept, [*near])
+        model = centered(rival, linearize(rival, u, units), units)
+        return replace(own, model=model, grams=search.errors.grams(model))
 
     def _suspects(self, own: Candidate) -> list[int]:
         """Return the trials that may have a gross error by a fit to all of them."""
