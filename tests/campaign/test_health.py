@@ -235,3 +235,12 @@ def test_the_share_of_the_diagonal_is_the_best_without_each_row(num, num_numbers
         losses.append(loss)
     best = SHARES[int(np.argmin(losses))]
     assert Spread.of(z).share == pytest.approx(float(best), rel=1e-3)
+
+
+def test_two_modes_have_more_density_than_a_gaussian_gives_them():
+    gen = torch.Generator().manual_seed(3)
+    side = torch.where(torch.rand(4_000, 1, generator=gen) < 0.5, -3.0, 3.0)
+    drawn = side + 0.3 * torch.randn(4_000, 1, generator=gen)
+    mode = torch.tensor([3.0])
+    gaussian, own = (float(Normal(*p).log_prob(mode)) for p in ((0, 3.01), (3, 0.3)))
+    assert gaussian + 0.5 < score_outcome(mode, drawn)[1] < own - math.log(2)

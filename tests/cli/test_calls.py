@@ -54,7 +54,6 @@ SLED, ASK = [*OF, "sled.py:slide"], ["--actions", "1,2"]
 CALLS = [
     # Numbers.
     (0, "", "tell camp 1e-20 --json"),
-    (0, "", "correct camp 0 -2e-1 --json"),
     *(
         (2, "expected", ["tell", "camp", x])
         for x in ("", "inf", "1e-50", "0,84", "1_000", "0.84 m")

@@ -209,7 +209,6 @@ def test_a_robot_s_loop(server):
 #: Requests, and what their errors say.
 WRONG = [
     ("\xff", "expected a JSON object a line; got 'utf-8' codec"),
-    ("{", "expected a JSON object a line; got Expecting property name"),
     ("[" * 100_000, "expected a JSON object a line; got"),
     ('{"id": ' + "[" * 900 + "]" * 900 + "}", "expected a JSON object a line; got"),
     ('{"command": "tell", "x": ' + "[" * 900 + "]" * 900 + "}", "expected options of"),
