@@ -1,4 +1,4 @@
-"""Small effects that tests of several rooms share."""
+"""Small effects, and readings with an error, that tests of several rooms share."""
 
 import torch
 from torch.distributions import HalfNormal, Independent, Normal
@@ -60,6 +60,12 @@ def louder(by=lambda phi, action: phi[:, :1], sd=1.0):
         return scale * (1 + by(phi, action))
 
     return effect("louder", hook="noise", prior=half(sd), apply=apply)
+
+
+def with_error(mean, sd, seed=0):
+    """Return what a sensor of some error reads of a mean, by a seed or a generator."""
+    gen = torch.Generator().manual_seed(seed) if isinstance(seed, int) else seed
+    return mean + sd * torch.randn(mean.shape, generator=gen)
 
 
 def autocorrelated(e, rho):

@@ -15,7 +15,6 @@ import torch
 
 from benchmarks import table as readme
 from benchmarks.__main__ import HERE, benchmarks, main, module_of, parser_of
-from benchmarks.__main__ import main as run
 from benchmarks.bits.run import FIGURES, figures, runs
 from benchmarks.criticism.cases import draw_case
 from benchmarks.criticism.scores import score_case
@@ -161,7 +160,7 @@ def test_a_strong_effect_of_world_a_is_named_and_lowers_the_error():
 def test_a_case_of_misfit_is_run_once_and_its_row_is_whole(tmp_path, capsys):
     command = ["misfit", "--group", "letters", "--kind", "CE", "--cases", "0", "1"]
     for _ in range(2):
-        run([*command, "--out", str(tmp_path / "{group}_{kind}.csv")])
+        main([*command, "--out", str(tmp_path / "{group}_{kind}.csv")])
     assert capsys.readouterr().out.count("letters_CE 0") == 1
     (row,) = read(tmp_path / "letters_CE.csv")
     (judged, *_) = read(RESULTS / "letters_CE.csv")
@@ -219,7 +218,7 @@ def test_intervals_of_robots_are_found_once_and_told(tmp_path, capsys):
     command = ["robots.coverage", "--seeds", "2000", "2001", "--machine", "spring-mass"]
     command += ["--condition", "friction 1", "--way", "sysid", "ours", "bare"]
     for _ in range(2):
-        run([*command, "--out", str(out)])
+        main([*command, "--out", str(out)])
         rows = pd.read_csv(out)
         assert {*rows.groupby("way").size()} == {2}
     inside = (rows.low <= rows.truth) & (rows.truth <= rows.high)
@@ -273,10 +272,7 @@ def test_a_test_that_fails_was_not_survived(tmp_path, monkeypatch):
     (tmp_path / "test_own.py").write_text(f"{text}\n    assert k % 2 == 0\n")
     monkeypatch.setattr(robustness, "ROOT", tmp_path)
     found = {row["case"]: row for row in robustness.by_tests(("test_*.py",))}
-    assert {case: row["survived"] for case, row in found.items()} == {
-        "0": True,
-        "1": False,
-    }
+    assert (found["0"]["survived"], found["1"]["survived"]) == (True, False)
     assert found["0"]["attack"] == "test_own test_even"
     assert "assert" in found["1"]["answer"]
 

@@ -128,11 +128,6 @@ def test_resume_keeps_what_is_spent(tmp_path):
     assert whole.state.spent == 7.0 + float(travel(action[None], torch.ones(1)))
 
 
-def test_a_cost_is_a_positive_number_an_action():
-    with pytest.raises(ValueError, match="expected positive costs of shape"):
-        within(5.0, lambda action, previous: 0 * action[:, 0])
-
-
 # Two far places of two measurements each, on both sides of a near and poor one
 
 PLACES = torch.tensor([0.0, -1.0, -1.0, 1.0, 1.0])

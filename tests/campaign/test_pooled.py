@@ -128,24 +128,6 @@ def test_an_effect_is_adopted_within_the_budget():
     assert torch.allclose(mean, torch.tensor([0.5, 0.8]), atol=0.15)
 
 
-def test_what_trials_may_take_adds_up_to_the_budget():
-    options = {"max_simulations": 240, "planned_trials": 2, "refinement": FEW}
-    c = Campaign(Blobs(), PRIOR, DiscreteActions([[0.2, 0.0]]), options=options)
-    may_take, meter = c._learner._rows_left, c.state.meter
-    for index in range(2):
-        taken = may_take("design", index)
-        assert 0.1 * meter.left < taken < 0.5 * meter.left
-        meter.spent += taken
-        meter.spent += may_take("belief", index)
-        c.attach([0.2, 0.0], torch.zeros(SIZE * SIZE))
-        c.state.processed.append(index)
-    assert 0 <= meter.left <= 2
-    meter.spent = 140
-    taken = may_take("design", 2)
-    meter.spent += taken
-    assert taken + may_take("belief", 2) == 50  # of an unplanned one, half of the rest
-
-
 def test_without_a_budget_a_trial_takes_a_round_s_simulations():
     """What its design took, its belief does not take again."""
     summaries = SummaryAction({"place": place, "nothing": nothing})

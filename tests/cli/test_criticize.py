@@ -88,7 +88,6 @@ def compared(monkeypatch):
 
 #: What lacks, and what is said of it.
 INCOMPARABLE = [
-    (["1,2"], OPTIONS, "at least two valid trials to fit; got 1"),
     (["1,2", "2,3"], OPTIONS[:2], "at least 3 repeats of one action"),
     (["1,2", "2,3"], [*OPTIONS[:2], "--noise", "0"], "expected --noise > 0"),
     (["1,2", "2,3"], OPTIONS[2:], "expected --theta-low and --theta-high"),
@@ -160,13 +159,6 @@ def test_a_task_gives_its_simulator_and_prior(compared):
     own, known = (model.mean(theta, action) for model in models)
     assert torch.equal(own, known)
     assert given.effects
-
-
-def test_trials_of_another_shape_than_a_task_s(tmp_path, capsys):
-    (tmp_path / "t.csv").write_text("action_1,x_1\n0.5,1\n1.0,2\n1.5,3\n")
-    words = ["criticize", str(tmp_path / "t.csv"), "--task", "ball_drops"]
-    assert main(words) == 2
-    assert "expected x of 60 samples" in capsys.readouterr().err
 
 
 # ``sbi-active gate``: a decision for a CI, by its exit status

@@ -5,7 +5,7 @@ from sbi.utils import BoxUniform
 from torch import Tensor
 
 from sbi_active.criticism import Effect
-from tests.effects import half, normal
+from tests.effects import half, normal, with_error
 
 SENSOR = 0.005
 SPEEDS = torch.tensor([1.0, 2.5, 1.5, 3.0, 2.0, 0.75, 2.75, 1.25, 2.25, 1.75])
@@ -32,4 +32,4 @@ def stop(theta, action, *, gain=0.0, drag=0.0):
 def slid(drag: float = 0.0, fn=stop) -> Tensor:
     """Return what is measured of ten trials, with a drag."""
     x = fn(torch.full((10, 1), 0.4), SPEEDS[:, None], drag=torch.full((10,), drag))
-    return x + SENSOR * torch.randn(x.shape, generator=torch.Generator().manual_seed(0))
+    return with_error(x, SENSOR)

@@ -4,6 +4,7 @@ import torch
 from sbi.utils import BoxUniform
 
 from sbi_active import SimulatorModel
+from tests.effects import with_error
 
 NOISE = 0.1
 PRIOR = BoxUniform(-3 * torch.ones(1), 3 * torch.ones(1))
@@ -19,6 +20,4 @@ MODEL = model()
 
 def read(mean, seed: int | torch.Generator = 0) -> torch.Tensor:
     """Return what the sensor reads of a mean, by a seed or a generator."""
-    gen = torch.Generator().manual_seed(seed) if isinstance(seed, int) else seed
-    mean = torch.as_tensor(mean)
-    return mean + NOISE * torch.randn(mean.shape, generator=gen)
+    return with_error(torch.as_tensor(mean), NOISE, seed)

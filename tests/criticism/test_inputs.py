@@ -19,7 +19,7 @@ from sbi_active.criticism.report.page import figures
 from sbi_active.criticism.rivals.trial_simulator import TrialSimulator
 from sbi_active.simulation import AutocorrelatedNoise, GaussianNoise, SimulatorModel
 from tests.criticism.motor_world import LIBRARY, MODEL, PRIOR, measured
-from tests.effects import autocorrelated, effect, normal
+from tests.effects import autocorrelated, effect, normal, with_error
 
 
 def test_what_a_motor_lacks_is_found_proposed_and_simulated_on():
@@ -92,9 +92,7 @@ def test_a_simulator_may_require_times(by_model):
     model = SimulatorModel(falling, noise=noise, sample_times=own)
     prior = BoxUniform(torch.tensor([5.0]), torch.tensor([15.0]))
     action = torch.linspace(1, 3, 6)[:, None]
-    gen = torch.Generator().manual_seed(0)
-    x = falling(torch.tensor([[9.81]]), action, times=times) + 0.3
-    x = x + 0.02 * torch.randn(x.shape, generator=gen)
+    x = with_error(falling(torch.tensor([[9.81]]), action, times=times) + 0.3, 0.02)
     trials = Trials(action, x, sample_times=times)
     effects = [effect(prior=normal(0.5))]
     if by_model:
@@ -109,21 +107,13 @@ def test_inputs_have_to_cover_the_times_of_a_model():
     def follow(theta, action, *, inputs):
         return theta * inputs["u"][:, :5]
 
-    times = torch.linspace(0, 1, 5)
-    model = SimulatorModel(follow, noise=0.1, sample_times=times)
+    model = SimulatorModel(follow, noise=0.1, sample_times=torch.linspace(0, 1, 5))
     prior = BoxUniform(torch.zeros(1), torch.ones(1))
-    for begin, message in (
-        (0.0, None),
-        (50.0, "x of trial 0 measured within .* 50 to"),
-    ):
-        grid = begin + torch.linspace(0, 2, 11)
-        inputs = {"u": torch.ones(3, 11)}
-        trials = Trials(None, torch.zeros(3, 5), inputs=inputs, input_times=grid)
-        if message is None:
-            Criticism(model, prior, trials)
-            continue
-        with pytest.raises(ValueError, match=message):
-            Criticism(model, prior, trials)
+    inputs, grid = {"u": torch.ones(3, 11)}, torch.linspace(0, 2, 11)
+    given = {"action": None, "x": torch.zeros(3, 5), "inputs": inputs}
+    Criticism(model, prior, Trials(**given, input_times=grid))
+    with pytest.raises(ValueError, match="x of trial 0 measured within .* 50 to"):
+        Criticism(model, prior, Trials(**given, input_times=50 + grid))
 
 
 # Generic effects of recordings: which there are, and that a loop finds them
@@ -197,7 +187,7 @@ def loop(wrong, *, measurement_sd=SENSOR, role=None, **options):
     action = ACTIONS.values
     phase = 6 * torch.rand(len(action), 1, generator=gen)
     x = swing(torch.tensor([[0.8]]), action) + wrong * (2.1 * TIMES + phase).sin()
-    x = x + SENSOR * torch.randn(x.shape, generator=gen)
+    x = with_error(x, SENSOR, gen)
     trials = Trials(action, x, sample_times=TIMES, role=role)
     options = {"effects": [BIAS], "actions": ACTIONS, **options}
     return Criticism(model, SWINGS, trials, **options)

@@ -13,7 +13,7 @@ from sbi_active.criticism import (
     Trials,
     close_loop,
 )
-from tests.effects import BIAS, drift, effect, gain, normal
+from tests.effects import BIAS, drift, effect, gain, normal, with_error
 
 PRIOR = BoxUniform(-3 * torch.ones(2), 3 * torch.ones(2))
 ACTIONS = DiscreteActions(torch.linspace(-2, 2, 17))
@@ -28,23 +28,21 @@ def response(theta, action, cubic=0.0):
 MODEL = SimulatorModel(response, noise=NOISE, parameter_names=["a", "b"])
 
 
-@pytest.mark.parametrize(
-    ("given", "options", "message"),
-    [
-        ((response, PRIOR, "logs"), {}, "model, a SimulatorModel; got <function"),
-        ((MODEL, PRIOR, "logs"), {}, "trials, as Trials; got 'logs'"),
-        ((MODEL, MODEL, "logs"), {}, "prior, a Distribution; got SimulatorModel"),
-        ((MODEL, PRIOR, Trials([1.0], [1.0])), {"effects": None}, "list .* got None"),
-        (
-            (MODEL, PRIOR, Trials([1.0], [1.0])),
-            {"effects": ["bias"]},
-            r"got \['bias'\]",
-        ),
-    ],
-)
-def test_parts_of_another_class_are_refused(given, options, message):
+ONE = Trials([1.0], [1.0])
+#: Parts of which one is of another class, effects, and what is said of it.
+MISPLACED = [
+    ((response, PRIOR, ONE), [], "model, a SimulatorModel; got <function"),
+    ((MODEL, MODEL, ONE), [], "prior, a Distribution; got SimulatorModel"),
+    ((MODEL, PRIOR, "logs"), [], "trials, as Trials; got 'logs'"),
+    ((MODEL, PRIOR, ONE), None, "list .* got None"),
+    ((MODEL, PRIOR, ONE), ["bias"], r"got \['bias'\]"),
+]
+
+
+@pytest.mark.parametrize(("given", "effects", "message"), MISPLACED)
+def test_parts_of_another_class_are_refused(given, effects, message):
     with pytest.raises(TypeError, match=message):
-        close_loop(*given, **options)
+        close_loop(*given, effects=effects)
 
 
 CUBIC = Effect.keyword("cubic", prior=normal(0.5))
@@ -62,9 +60,8 @@ def measured(seed, phi, *, num=10, held_out=0):
     phi = {k: torch.full((total, 1), v) for k, v in phi.items()}
     index = torch.arange(float(total))
     x = real.evaluate(theta, phi, action, context=Context(index))
-    x = x + NOISE * torch.randn(x.shape, generator=gen)
     role = ["fit"] * num + ["held out"] * held_out
-    return Trials(action, x, role=role)
+    return Trials(action, with_error(x, NOISE, gen), role=role)
 
 
 #: By name: seed, size of each effect that is hidden, trials.
@@ -174,10 +171,8 @@ def test_a_nuisance_of_each_trial_is_no_effect():
 
 def test_noise_from_repeats_is_summed_out():
     bare = SimulatorModel(response)
-    gen = torch.Generator().manual_seed(0)
     action = torch.cat([ACTIONS.values[::3], ACTIONS.values[:1].expand(4, 1)])
-    x = response(torch.tensor([[1.0, -0.5]]), action)
-    x = x + NOISE * torch.randn(x.shape, generator=gen)
+    x = with_error(response(torch.tensor([[1.0, -0.5]]), action), NOISE)
     clean = Criticism(bare, PRIOR, Trials(action, x), effects=[BIAS, GAIN])
     assert not clean.detect().alarm
     assert clean.residuals().noise == "estimated"
@@ -204,13 +199,11 @@ LABELS = ["swing [rad]", "rail [m]"]
 
 
 ONES, MORE = torch.ones(3), torch.ones(3, 3)
-LOST = torch.tensor([torch.nan, torch.nan, 1.0])
 SCATTER = effect("scatter", hook="noise", apply=lambda sd, *_: sd)
 
 
 SWAPPED = Trials(ONES, torch.ones(3, 2), channel_labels=LABELS)
 BEYOND = Trials(ONES, MORE, sample_times=[0, 0.5, 1.5])
-NONE_FIT = Trials(ONES, LOST, role=["fit", "fit", "held out"])
 
 
 #: What lacks, and what is said of it.
@@ -219,7 +212,7 @@ INCOMPARABLE = [
     ("noise would count twice", {"model": SimulatorModel(noisy, noise=NOISE)}),
     ("at least two valid trials to fit; got 1", {"trials": measured(1, {}, num=1)}),
     ("trials of the simulator's shape", {"trials": Trials(ONES, torch.ones(3, 4))}),
-    ("at least two valid trials to fit; got 0", {"trials": NONE_FIT}),
+    ("x of 5 samples a trial", {"model": TIMED, "trials": Trials(ONES, ONES)}),
     ("expected effects not named none", {"effects": [SCATTER]}),
     ("actions of dimension 1", {"actions": DiscreteActions([[1.0, 2.0]])}),
     ("rail, swing; got swing, rail", {"model": TWO, "trials": SWAPPED}),

@@ -138,16 +138,11 @@ def lose_rows(simulations, share, seed=0):
     """Faults that have nothing to do with the parameters."""
     generator = torch.Generator().manual_seed(seed)
     missing = torch.rand(simulations.x.shape[:2], generator=generator) < share
-
-    def lose(part):
-        if part is None:
-            return None
-        return part.masked_fill(missing[..., None], torch.nan)
-
-    return CandidateSimulations(
-        simulations.theta, simulations.action, lose(simulations.x),
-        lose(simulations.mean), simulations.noise, lose(simulations.replicate), missing,
-    )  # fmt: skip
+    lost = {
+        name: part.masked_fill(missing[..., None], torch.nan)
+        for name, part in simulations.parts().items()
+    }
+    return replace(simulations, missing=missing, **lost)
 
 
 @pytest.mark.parametrize("world", [CERTAIN, LUCKIER], ids=["certain", "lucky"])

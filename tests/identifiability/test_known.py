@@ -185,16 +185,28 @@ def friction(friction, mass, speed):
     return speed**2 / (2 * 9.81 * friction) / (mass + 0.5)
 
 
+def damped(size, damping, speed):
+    return speed * size * torch.exp(-damping)
+
+
+def drag(friction, drag, speed):
+    return torch.log1p(drag * speed**2 / (9.81 * friction)) / (2 * drag)
+
+
+def spread(mean, sd, speed):
+    return mean * speed + sd * torch.randn_like(mean)
+
+
+def failing(mean, limit, speed):
+    return torch.where(limit > 0.5, torch.nan, mean * speed)
+
+
 #: Outcome, prior, and the combinations through which the parameters enter it.
 UNTOLD = {
     "product": (lambda a, b, v: v * a * b, [POSITIVE] * 2, ["a * b"]),
     "ratio": (lambda a, b, v: torch.sin(v * a / b), [POSITIVE] * 2, ["a / b"]),
     "shift": (friction, [POSITIVE] * 2, ["a * (b + 0.5)"]),
-    "exponential": (
-        lambda a, b, v: v * a * torch.exp(-b),
-        [POSITIVE, CENTERED],
-        ["a * exp(-b)"],
-    ),
+    "exponential": (damped, [POSITIVE, CENTERED], ["a * exp(-b)"]),
     "three": (lambda a, b, c, v: v * a * b / c, [POSITIVE] * 3, ["a * b / c"]),
     "two of three": (
         lambda a, b, c, v: torch.cat([v * a * b, v * b * c], 1),
@@ -259,22 +271,13 @@ def test_what_is_below_the_noise_is_hardly_determined_and_not_undetermined():
 
 
 DETERMINED = {
-    "fall with drag": (
-        lambda mu, k, v: torch.log1p(k * v**2 / (9.81 * mu)) / (2 * k),
-        [POSITIVE] * 2,
-    ),
+    "fall with drag": (drag, [POSITIVE] * 2),
     "decay": (lambda a, b, v: a * torch.exp(-b * v), [POSITIVE] * 2),
-    "mean and spread": (
-        lambda a, b, v: a * v + b * torch.randn_like(a),
-        [CENTERED, POSITIVE],
-    ),
+    "mean and spread": (spread, [CENTERED, POSITIVE]),
     "one far stronger": (lambda a, b, v: 1e3 * a * v + b, [CENTERED] * 2),
     "too much stronger for float32": (lambda a, b, v: 1e5 * a * v + b, [CENTERED] * 2),
     "weights that may vanish": (lambda a, b, v: a * b + a * v, [CENTERED] * 2),
-    "only by failing": (
-        lambda a, b, v: torch.where(b > 0.5, torch.nan, a * v),
-        [POSITIVE] * 2,
-    ),
+    "only by failing": (failing, [POSITIVE] * 2),
 }
 
 

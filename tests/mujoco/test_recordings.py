@@ -105,38 +105,37 @@ def test_an_input_that_is_not_told_is_held():
     assert push[7] == push[6]
 
 
+HELD = held_arm("servo")
+
+
 def encoder_log(**changes):
     time = np.arange(0.0, 1.0, 0.02)
     log = {"time": time, "angle": 0.3 * np.sin(3 * time), "servo": 0 * time}
     return {**log, **changes}
 
 
-def read_logs(*logs, xml=None):
-    return from_mjcf(
-        xml or held_arm("servo"),
-        {"hinge.damping": (0.0, 1.0)},
-        noise=0.01,
-        recordings=[*logs],
-    ).trials
+def read_log(log, xml=HELD):
+    arm = xml, {"hinge.damping": (0.0, 1.0)}
+    return from_mjcf(*arm, noise=0.01, recordings=[log]).trials
 
 
 @pytest.mark.filterwarnings("error")
 def test_a_log_of_milliseconds_is_said_before_anything_runs():
     with pytest.raises(UserWarning, match="10,000 time steps of 0.002 s.*in ms"):
-        read_logs(encoder_log(time=1_000 * encoder_log()["time"]))
+        read_log(encoder_log(time=1_000 * encoder_log()["time"]))
 
 
 def test_angles_that_wrap_or_are_degrees_are_said():
     turning = np.linspace(0, 15, 50)
     with pytest.warns(UserWarning, match=r"jumps by about 2 pi in 2 places"):
-        read_logs(encoder_log(angle=np.remainder(turning, 2 * np.pi)))
+        read_log(encoder_log(angle=np.remainder(turning, 2 * np.pi)))
     limits = 'axis="0 1 0" limited="true" range="-90 90"'
-    limited = held_arm("servo").replace('axis="0 1 0"', limits)
+    limited = HELD.replace('axis="0 1 0"', limits)
     limited = limited.replace('name="angle"', 'name="hinge"')
     log = encoder_log(hinge=np.linspace(0, 60, 50))
     del log["angle"]
     with pytest.warns(UserWarning, match="range ends at 1.57.* rad: are these degrees"):
-        read_logs(log, xml=limited)
+        read_log(log, limited)
 
 
 # A robot's parameters from logs of one that has dry friction besides

@@ -51,9 +51,8 @@ def test_rows_do_not_depend_on_batches_or_workers():
     theta, action = robot.prior.sample((30,)), RELEASE.sample((30,))
     x = simulate(robot.simulator, theta, action, seed=0).x
     for options in ({"batch_size": 7}, {"num_workers": 2, "batch_size": 11}):
-        assert (
-            simulate(robot.simulator, theta, action, seed=0, **options).x == x
-        ).all()
+        same = simulate(robot.simulator, theta, action, seed=0, **options).x
+        assert (same == x).all()
     again = robot.simulator.mean(theta, action)
     one = torch.cat([robot.simulator.mean(t[None], a[None])
                      for t, a in zip(theta[:9], action[:9], strict=True)])  # fmt: skip

@@ -8,15 +8,9 @@ import pytest
 import torch
 from sbi.utils import BoxUniform
 
-from sbi_active import (
-    Campaign,
-    GaussianNoise,
-    InformationGainDesigner,
-    RandomDesigner,
-    SimulatorModel,
-    simulate,
-)
+from sbi_active import Campaign, GaussianNoise, SimulatorModel, simulate
 from sbi_active.criticism import Criticism, Trials
+from sbi_active.design import InformationGainDesigner, RandomDesigner
 from sbi_active.seeding import row_normals, row_seeds
 from sbi_active.simulation import MissingRowsWarning, SimulationError, check_simulator
 from sbi_active.simulation.model import takes_seeds

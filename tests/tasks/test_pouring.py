@@ -7,7 +7,7 @@ from scipy.ndimage import maximum_filter
 
 from sbi_active import simulate
 from sbi_active.tasks import get_task
-from sbi_active.tasks.pouring import ImagePCA, intersection_volume
+from sbi_active.tasks.pouring import ImagePCA
 from sbi_active.tasks.pouring.materials import cubes
 from sbi_active.tasks.pouring.raster import height_image, rotations
 from sbi_active.tasks.pouring.scene import pour
@@ -126,12 +126,3 @@ def test_principal_components_tell_what_varies():
     z = torch.cat([pca(fresh), torch.ones(40, 1)], 1)
     fit = z @ torch.linalg.lstsq(z, weight).solution
     assert float((fit - weight).abs().max()) < 1e-3
-
-
-def test_intersection_volume_is_what_two_heaps_share():
-    real = torch.zeros(22_500)
-    real[:10] = 4.0
-    simulated = torch.zeros(2, 22_500)
-    simulated[0, 5:15] = 6.0
-    assert intersection_volume(real, simulated).tolist() == [20.0, 0.0]
-    assert float(intersection_volume(real, real[None])) == 40.0

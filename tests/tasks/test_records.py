@@ -21,15 +21,11 @@ from sbi_active.tasks.stepping import lagged
 
 HOOP = torch.tensor([[7.3, 0.8, 0.0]], dtype=torch.float64)
 TANKS = torch.tensor([[0.05, 0.05, 0.05, 0.04]], dtype=torch.float64)
+FILLED = [*cascaded_tanks.make_effects(), start_levels()]
+#: Equations, parameters, effects, time step, and bounds of the voltage.
 MACHINES = {
     "hoop": (spin, HOOP, ball_and_hoop.make_effects(), 0.1, (-0.9, 0.9)),
-    "tanks": (
-        levels,
-        TANKS,
-        [*cascaded_tanks.make_effects(), start_levels()],
-        4.0,
-        (0.5, 6.0),
-    ),
+    "tanks": (levels, TANKS, FILLED, 4.0, (0.5, 6.0)),
 }
 
 

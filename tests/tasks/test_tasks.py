@@ -26,11 +26,6 @@ from tests.oracles.problems import PROBLEMS
 from tests.oracles.reference import answers
 
 
-def test_unknown_task_lists_the_valid_names():
-    with pytest.raises(ValueError, match="expected a task among 'numerical'.*'abc'"):
-        get_task("abc")
-
-
 @pytest.mark.parametrize("variant", ["linear", "sinh", "square"])
 def test_the_simulator_and_the_oracle_are_one_model(variant):
     """Ranks of the truth's exact density among exact draws are uniform."""

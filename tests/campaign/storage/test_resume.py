@@ -187,9 +187,8 @@ class OwnPrior(Uniform):
 
 def test_what_only_its_author_can_make_is_asked_for(tmp_path):
     prior = torch.distributions.Independent(OwnPrior(torch.zeros(2), torch.ones(2)), 1)
-    campaign = campaigns.go_on(
-        campaigns.new(tmp_path / "c", prior=prior, cost=price), 1
-    )
+    given = {"prior": prior, "cost": price}
+    campaign = campaigns.go_on(campaigns.new(tmp_path / "c", **given), 1)
     campaign.close()
     with pytest.raises(ValueError, match="expected prior=, which only its author"):
         Campaign.load(tmp_path / "c", simulator=campaigns.MODEL, cost=price)
@@ -199,9 +198,7 @@ def test_what_only_its_author_can_make_is_asked_for(tmp_path):
     assert torch.equal(campaigns.draws(reader), campaigns.draws(campaign))
     with pytest.raises(ValueError, match=r"limits .*\['cost'\]; got \[\]"):
         Campaign.load(tmp_path / "c", simulator=campaigns.MODEL, prior=prior)
-    again = Campaign.load(
-        tmp_path / "c", simulator=campaigns.MODEL, prior=prior, cost=price
-    )
+    again = Campaign.load(tmp_path / "c", simulator=campaigns.MODEL, **given)
     assert torch.equal(campaigns.draws(again), campaigns.draws(campaign))
 
 
@@ -249,9 +246,8 @@ def test_adopted_effects_come_back(tmp_path):
 def test_rows_of_a_campaign_are_used_again(tmp_path):
     with campaigns.new(tmp_path / "c", simulator=counted, method="asbi") as campaign:
         assert campaign.posterior is not None  # the first round's network
-    worth = reuse(
-        Bank(tmp_path / "c", name="drawn"), campaigns.PRIOR
-    ).effective_sample_size
+    reused = reuse(Bank(tmp_path / "c", name="drawn"), campaigns.PRIOR)
+    worth = reused.effective_sample_size
     assert worth == pytest.approx(campaigns.OPTIONS.num_simulations)
 
 

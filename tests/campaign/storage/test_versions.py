@@ -41,11 +41,8 @@ def test_what_is_to_be_done_is_said(old, capsys):
     with pytest.raises(ValueError, match="sbi-active migrate"):
         Campaign.load(old)
     assert main(["migrate", str(old)]) == 0
-    assert capsys.readouterr().out.splitlines() == [
-        "log: 5",
-        f"drawn: {ROWS}",
-        f"the files of before are in {old / 'version-1'}",
-    ]
+    said = f"log: 5\ndrawn: {ROWS}\nthe files of before are in {old / 'version-1'}\n"
+    assert capsys.readouterr().out == said
     names = sorted(path.name for path in old.iterdir())
     assert names == ["campaign.toml", "store.db", "version-1"]
     for path in FOLDER.rglob("*.*"):

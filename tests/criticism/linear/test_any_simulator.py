@@ -12,7 +12,6 @@ from sbi_active.criticism import Criticism, Trials
 from sbi_active.criticism.linear.screening import linear_models
 from sbi_active.criticism.misfit.verdict import judge
 from sbi_active.criticism.results import SCATTER, UNEXPLAINED, ModelKey
-from sbi_active.criticism.rivals import heavy_tails
 from sbi_active.criticism.rivals.rival_set import RivalSet
 from sbi_active.criticism.steps.detection import credible_set
 from tests.criticism.misfit import oscillator
@@ -90,21 +89,6 @@ def test_a_deviation_that_is_a_parameter_is_found():
     scale = found.search.model(BARE).scale
     unit = found.search.unit
     assert np.median(unit * scale) == pytest.approx(2.5 * SD, rel=0.35)
-
-
-@pytest.mark.parametrize("bias", [0.0, 1.0])
-def test_heavy_tails_have_the_bayes_factor_of_importance_sampling(bias):
-    x = measured(bias)
-    x[4] += 3.0
-    model = SimulatorModel(curve, noise=StudentTNoise(SD, 3.0))
-    found = verdict_of(model, x)
-    linear = gain_of(found.states.log_evidence)
-    some = RivalSet(model, PRIOR, Trials(ACTION, x), EFFECTS, seed=0)
-    sampled = gain_of(lambda key: some.fit(key).evidence.log_evidence)
-    # Three widths of the effect's prior, of which one was declared.
-    assert linear == pytest.approx(sampled, abs=1.5, rel=0.15)
-    weight = 1 / found.search.model(BIAS).scale
-    assert weight.argmin() == 4
 
 
 def test_which_trials_have_an_outcome_tells_of_parameters_and_effects():
@@ -214,27 +198,6 @@ def test_what_is_undeclared_beside_heavy_tails_is_no_scatter():
     assert found.key == ModelKey(error=UNEXPLAINED)
     joint = found.states.joint(BARE)
     assert joint[found.key] > joint[ModelKey(error=SCATTER)] + 10
-
-
-def test_gaussians_touch_the_density_from_below():
-    for at in (0.0, 0.7, 6.0):
-        errors = np.append(np.linspace(-9, 9, 101), at)
-        weight, peak = heavy_tails.tangent(np.array(at), DF)
-        below = peak - 0.5 * (weight * errors) ** 2
-        density = heavy_tails.student(errors, DF)
-        assert (below <= density + 1e-12).all()
-        assert below[-1] == pytest.approx(density[-1])
-
-
-def test_squares_of_signed_deviances_are_what_log_densities_lose():
-    errors = np.array([-1e8, -3.0, 0.0, 1e-6, 2.0])
-    found = heavy_tails.signed_deviance(errors, DF)
-    lost = heavy_tails.student(np.zeros(5), DF) - heavy_tails.student(errors, DF)
-    assert 0.5 * found**2 == pytest.approx(lost)
-    assert heavy_tails.from_deviance(found, DF) == pytest.approx(errors)
-    slope = (heavy_tails.signed_deviance(errors + 1e-4, DF) - found)[1:] / 1e-4
-    own = heavy_tails.deviance_slope(errors, DF)[1:]
-    assert own == pytest.approx(slope, rel=1e-3)
 
 
 @pytest.mark.parametrize("far", [0.0, 30.0])

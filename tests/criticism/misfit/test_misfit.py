@@ -9,7 +9,6 @@ from sbi_active import SimulatorModel
 from sbi_active.criticism import Criticism, Effect, Trials, close_loop
 from sbi_active.criticism.linear.screening import linear_models
 from sbi_active.criticism.misfit import record
-from sbi_active.criticism.misfit.draws import spread_of
 from sbi_active.criticism.misfit.guesses import MARGIN, guess_residual
 from sbi_active.criticism.results import ModelKey
 from sbi_active.criticism.rivals.trial_simulator import TrialSimulator
@@ -122,24 +121,6 @@ def test_residuals_are_those_of_the_best_fit(named):
     left = find_residuals(named.rivals, key)
     own = (left.x - left.mean).ravel()[search.errors.measurements.position]
     assert own == pytest.approx(search.unit * search.model(key).residual, abs=1e-6)
-
-
-def test_predictions_are_as_wide_as_left_out_errors_say(named):
-    key, found = named.trace().key, named._verdict
-    model, errors, num = found.model(key), found.search.errors, 2_000
-    rows = found.search.unit[:, None] * model.rows[: model.num, 1:]
-    spread = spread_of(found, key)
-    variance = ((rows @ found.covariance(key)) * rows).sum(1)
-    size = spread.size[errors.measurements.channel]
-    prediction = predict(named.rivals, key=key, num_draws=num)
-    expected = spread.scale * np.sqrt(variance + size**2)
-    # Four errors of a deviation, and the bend within a tenth of it.
-    assert prediction.moments()[1] == pytest.approx(expected, rel=4 / np.sqrt(2 * num))
-    left = found.search.found[key].left.error * found.search.unit
-    ratio = left**2 / (variance + size**2)
-    parts = [ratio[errors.fold == f].mean() for f in range(errors.num_folds)]
-    assert spread.square == pytest.approx(np.array(parts))
-    assert spread.scale**2 == pytest.approx(np.mean(parts))
 
 
 # One trial that errs far more than the others, where every model misses

@@ -23,7 +23,7 @@ from tests.criticism.misfit.oscillator import ACTION, EFFECTS, trials
 from tests.criticism.misfit.oscillator import MODEL as OSCILLATOR
 from tests.criticism.misfit.oscillator import PRIOR as RATES
 from tests.criticism.slope_world import MODEL, NOISE, PRIOR, read
-from tests.effects import BIAS, added, gain
+from tests.effects import BIAS, added, gain, with_error
 
 FORWARD = DiscreteActions([1.0, 2.0, 3.0])
 BOTH = DiscreteActions([-3.0, -1.0, 1.0, 3.0])
@@ -210,8 +210,7 @@ def aliased():
     prior = BoxUniform(torch.tensor([0.3, 0.0]), torch.tensor([2.0, 1.0]))
     generator = torch.Generator().manual_seed(1)
     action = ANGLES.values[torch.randperm(11, generator=generator)[:8]]
-    x = truth(action)
-    x = x + FINE * torch.randn(x.shape, generator=generator)
+    x = with_error(truth(action), FINE, generator)
     gains = [e for e in generic_effects(model, ANGLES) if e.name.endswith(" gain")]
     return Criticism(model, prior, Trials(action, x), effects=gains, actions=ANGLES)
 

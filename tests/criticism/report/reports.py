@@ -9,7 +9,7 @@ from sbi.utils import BoxUniform
 from sbi_active import DiscreteActions, SimulatorModel
 from sbi_active.criticism import Trials, close_loop, results
 from sbi_active.criticism.contradictions import Misfit, ModelError, Support
-from tests.effects import added, on_outcomes
+from tests.effects import added, on_outcomes, with_error
 
 DRAG = on_outcomes(
     "drag",
@@ -27,8 +27,7 @@ def trials(action=SHUFFLED[:8], **more) -> Trials:
     """Return six numbers a trial, with a drag of a tenth."""
     action = torch.tensor(action)[:, None]
     x = (0.3 + 0.5 * action + 0.1 * action * action.abs()).repeat(1, 6)
-    generator = torch.Generator().manual_seed(0)
-    return Trials(action, x + 0.1 * torch.randn(x.shape, generator=generator), **more)
+    return Trials(action, with_error(x, 0.1), **more)
 
 
 FITTED = trials()

@@ -13,7 +13,7 @@ from sbi_active.criticism import Trials, close_loop, generic_effects
 from sbi_active.criticism.report.gate import EXIT_CODES
 from tests.criticism import block
 from tests.criticism.slope_world import MODEL, NOISE, PRIOR, read
-from tests.effects import BIAS
+from tests.effects import BIAS, with_error
 
 ACTIONS = DiscreteActions(torch.linspace(-2, 2, 9))
 
@@ -95,9 +95,8 @@ def test_trajectories_that_tell_a_product_alone_are_not_identifiable():
         swing, noise=1e-3, parameter_names=["stiffness", "factor"], sample_times=times
     )
     prior = BoxUniform(torch.tensor([1.0, 0.5]), torch.tensor([20.0, 2.0]))
-    gen, xi = torch.Generator().manual_seed(0), torch.linspace(0.5, 1.5, 8)[:, None]
-    x = swing(torch.tensor([[9.0, 1.1]]).expand(8, -1), xi)
-    x = x + 1e-3 * torch.randn(x.shape, generator=gen)
+    xi = torch.linspace(0.5, 1.5, 8)[:, None]
+    x = with_error(swing(torch.tensor([[9.0, 1.1]]).expand(8, -1), xi), 1e-3)
     report = close_loop(model, prior, Trials(xi, x, sample_times=times), plan=False)
     assert report.gate.decision == "NOT_IDENTIFIABLE"
     assert "stiffness" in report.gate.reason
@@ -199,9 +198,9 @@ def test_a_noise_declared_too_large_hides_what_is_missing(times, ships):
 def test_a_parameter_whose_sign_no_trial_tells_is_not_known():
     """One sign was said to be known to a hundredth, and the gate shipped."""
     model = SimulatorModel(lambda theta, xi: theta**2 * xi, noise=NOISE)
-    gen, xi = torch.Generator().manual_seed(0), torch.linspace(-2, 2, 12)[:, None]
-    x = 4.0 * xi + NOISE * torch.randn(xi.shape, generator=gen)
-    report = close_loop(model, PRIOR, Trials(xi, x), effects=[BIAS], plan=False)
+    xi = torch.linspace(-2, 2, 12)[:, None]
+    trials = Trials(xi, read(4.0 * xi))
+    report = close_loop(model, PRIOR, trials, effects=[BIAS], plan=False)
     assert report.gate.decision == "NOT_ENOUGH_DATA"
     assert report.gate.details == {"parameters": ["theta_1"]}
     slope = report.tracing.evidences["none"].draws[:, 0]

@@ -98,38 +98,30 @@ def forced(*, taken):
 MISSED = MissedTrial(position=0, name="7", size=60.0, p_value=0.0, by_both=True)
 ASIDE = OutlyingTrial(position=3, name="3", times=9.0)
 BOUND = BoundParameter(name="mu_1", model="none", side="lower", bound=0.5, beyond=0.4)
+EACH = np.arange(40.0)  # times of the samples
+WITHDRAWN = {"instead_of": "drag", "refuted": (1.0, 2.0)}
 WEAK = {"log_bayes_factor": 1.0, "p_value": 1e-9}
 SORTED = reports.trials(sorted(reports.trials().action[:, 0].tolist()))
-NEARLY = [2.0, -1.0, 3.0, 1.0, -2.0]
+UNORDERED = Trials(SORTED.action, SORTED.x, order="unknown")
+SMALL = {"lower_p_value": 1e-9, "chi_square": 1.0}
+FIVE = reports.trials([2.0, -1.0, 3.0, 1.0, -2.0])
 
 #: By code, and words where it has two kinds: a report that deserves it, and one that
 #: comes near.
 CASES = {
     "SA501": (with_noise("estimated"), with_noise("declared")),
-    "SA502": (
-        {"trials": reports.trials(NEARLY[:4])},
-        {"trials": reports.trials(NEARLY)},
-    ),
-    "SA503": (
-        {"trials": SORTED},
-        {"trials": Trials(SORTED.action, SORTED.x, order="unknown")},
-    ),
+    "SA502": ({"trials": FIVE[:4]}, {"trials": FIVE}),
+    "SA503": ({"trials": SORTED}, {"trials": UNORDERED}),
     "SA504": ({"designed": True}, {}),
     "SA505 gave no measurement": (outcomes([3], [1.0] * 8), outcomes([], [1.0] * 8)),
     "SA505 gave a measurement": (outcomes([], [0.0] * 8), outcomes([], [0.5] * 8)),
     "SA506": (jumps(0.2), jumps(None)),
     "SA507 sample_times": (smooth(0.95), smooth(0.0)),
-    "SA507 AutocorrelatedNoise": (
-        smooth(0.95, np.arange(40.0)),
-        smooth(0.95, np.arange(40.0), known=0.9),
-    ),
+    "SA507 AutocorrelatedNoise": (smooth(0.95, EACH), smooth(0.95, EACH, known=0.9)),
     "SA509": (noted(**WEAK), noted(**WEAK | {"p_value": 0.02})),
     "SA510": (told(p_value=1e-4), told(p_value=0.1)),
     "SA512 does not lower": (errors(1.1), errors(0.9)),
-    "SA512 is not named": (
-        told("unexplained", instead_of="drag", refuted=(1.0, 2.0)),
-        told(),
-    ),
+    "SA512 is not named": (told("unexplained", **WITHDRAWN), told()),
     "SA513": (told(set_aside=(ASIDE,)), told()),
     "SA514": ({"evaluation": replace(reports.MADE.evaluation, missed=(MISSED,))}, {}),
     "SA515": (pushed(3.0), pushed(2.0)),
@@ -138,10 +130,7 @@ CASES = {
     "SA520": ({"exploratory": True}, {}),
     "SA521": (told("outlier", outliers={3.0: 0.95}), told(outliers={3.0: 0.95})),
     "SA522": (told(needed=(3.0,)), told(needed=(3.0, 5.0))),
-    "SA523": (
-        noted(lower_p_value=1e-9, chi_square=1.0),
-        noted(lower_p_value=0.1, chi_square=30.0),
-    ),
+    "SA523": (noted(**SMALL), noted(lower_p_value=0.1, chi_square=30.0)),
     "SA103": (told(bounds=Bounds(parameters=(BOUND,))), told()),
     "SA529": (growing(0.4), growing(0.0)),
     "SA534": (repeated(0.5) | told("none"), repeated(0.0) | told("none")),

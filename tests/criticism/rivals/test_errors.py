@@ -8,12 +8,7 @@ from scipy import stats
 from scipy.stats import multivariate_normal
 from torch.distributions import Independent, LogNormal, Normal, Uniform
 
-from sbi_active import (
-    AutocorrelatedNoise,
-    GaussianNoise,
-    SimulatorModel,
-    estimate_noise,
-)
+from sbi_active import GaussianNoise, SimulatorModel, estimate_noise
 from sbi_active.criticism import Criticism, Effect, Trials
 from sbi_active.criticism.data.measurements import Measurements
 from sbi_active.criticism.rivals.coordinates import SearchCoordinates
@@ -26,6 +21,7 @@ from sbi_active.criticism.rivals.error_models import (
     measurement_sds,
 )
 from sbi_active.criticism.rivals.residual_process import TIME_LENGTH, ResidualProcess
+from sbi_active.simulation import AutocorrelatedNoise
 from tests.effects import effect, half, normal
 
 TIMES = np.array([0.0, 0.1, 0.3, 0.6, 1.0])
@@ -116,24 +112,6 @@ def test_a_posterior_over_the_size_is_summed_out_by_draws():
 
 
 # Noise of which the size is unknown in each channel: fits tell the ratio
-
-
-def test_only_the_ratio_of_the_sizes_is_left_to_fits():
-    gen, unit = torch.Generator().manual_seed(0), torch.tensor([0.5, 40.0]).double()
-    x = torch.randn(3, 4, 2, generator=gen).double() * unit
-    m = Measurements.of(Trials(torch.arange(3.0), x, sample_times=TIMES[:4]))
-    given = {"correlation_time": (0.05, 2.0), "num_sds": 6, "num_times": 3}
-    noise = AutocorrelatedNoise.unknown(sd=[(0.1, 3.0), (10.0, 300.0)], **given)
-    grid = declared_noise(noise, m)
-    assert grid.is_by_channel
-    sizes = [np.array(own)[m.channel] for own in ((0.5, 40.0), (0.2, 60.0))]
-    sized = grid.sized(sizes)
-    assert len(sized.cells) == 2 * len(grid.cells) == 6
-    # Half of the common factors are on either side of the sizes that fits tell.
-    assert np.exp(np.log(sized.scales).mean()) == pytest.approx(1.0)
-    each = [grid.sized([own]).log_likelihood(m.x[None])[0] for own in sizes]
-    expected = np.logaddexp.reduce(each) - np.log(2)
-    assert sized.log_likelihood(m.x[None])[0] == pytest.approx(expected)
 
 
 def gliding(theta, action, *, times, drag=0.0):

@@ -9,12 +9,7 @@ from sbi.utils import BoxUniform
 from scipy.stats import kstest, norm
 from torch.distributions import HalfNormal, Independent, LogNormal
 
-from sbi_active import (
-    AutocorrelatedNoise,
-    DiscreteActions,
-    SimulatorModel,
-    StudentTNoise,
-)
+from sbi_active import DiscreteActions, SimulatorModel
 from sbi_active.criticism import Criticism, Effect, Trials, close_loop
 from sbi_active.criticism.misfit.contrary import unless_refuted
 from sbi_active.criticism.misfit.evaluation import evaluate_held_out
@@ -22,14 +17,14 @@ from sbi_active.criticism.misfit.record import traced
 from sbi_active.criticism.results import NONE
 from sbi_active.criticism.steps.detection import LEVEL
 from sbi_active.criticism.steps.missed_trials import outlying_trials
-from sbi_active.simulation import estimate_noise
+from sbi_active.simulation import AutocorrelatedNoise, StudentTNoise, estimate_noise
 from tests.criticism.block import DRAG, ROLE, SENSOR, SPEEDS, friction, slid, stop
 from tests.criticism.misfit.oscillator import EFFECTS, MODEL, PRIOR
 from tests.criticism.misfit.oscillator import trials as oscillations
 from tests.criticism.report.reports import misfit
 from tests.criticism.report.reports import tracing as reported
 from tests.criticism.steps import linear_world as world
-from tests.effects import autocorrelated, effect, half, normal, on_outcomes
+from tests.effects import autocorrelated, effect, half, normal, on_outcomes, with_error
 
 # What a verdict rests on
 
@@ -154,9 +149,8 @@ def test_what_no_model_predicts_refutes_none(fitted):
     tracing, some = fitted
     x = world.measured(curve=0.5, seed=1)
     mean, _ = world.posterior(world.measured(curve=0.5), ("curve",))
-    x[0] += (
-        1e4 if world.columns(("curve",))[0, 2] * mean[2] < 0 else -1e4
-    )  # nearer the bare
+    side = np.sign(world.columns(("curve",))[0, 2] * mean[2])
+    x[0] -= 1e4 * float(side)  # nearer the bare
     evaluation = evaluate_held_out(some, tracing, Trials(world.ACTION, x))
     rmse = evaluation.table.set_index("metric").loc["rmse"]
     assert rmse["after"] > rmse["before"]
@@ -247,9 +241,7 @@ def scaled(x, phi, action, context):
 def loop(*effects, x=None, fn=swing):
     model = SimulatorModel(fn, noise=0.05, sample_times=TIMES)
     action = SIZES.values[[0, 2, 4, 1, 5, 3]]
-    x = swing(TRUE, action) if x is None else x
-    gen = torch.Generator().manual_seed(0)
-    x = x + 0.05 * torch.randn(x.shape, generator=gen)
+    x = with_error(swing(TRUE, action) if x is None else x, 0.05)
     trials = Trials(action, x, sample_times=TIMES)
     return Criticism(model, SWINGS, trials, effects=effects, actions=SIZES)
 
@@ -330,8 +322,8 @@ PAIRS = [
 @pytest.mark.parametrize(("names", "pair"), PAIRS)
 def test_effects_that_are_alike_near_zero_alone_are_told_apart(names, pair):
     model = SimulatorModel(respond, noise=0.02, sample_times=STAMPS)
-    gen, action = torch.Generator().manual_seed(0), FREQUENCIES.values
-    x = respond(torch.ones(6, 1), action) + 0.02 * torch.randn(6, 31, generator=gen)
+    action = FREQUENCIES.values
+    x = with_error(respond(torch.ones(6, 1), action), 0.02)
     trials = Trials(action, x, sample_times=STAMPS)
     given = {"effects": [LATE[n] for n in names], "actions": FREQUENCIES}
     found = Criticism(model, Independent(GAIN, 1), trials, **given).equivalent()

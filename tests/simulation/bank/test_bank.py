@@ -1,8 +1,8 @@
-import os
 import signal
 import time
-import traceback
 import warnings
+from contextlib import contextmanager
+from multiprocessing import get_context
 
 import pytest
 import torch
@@ -27,6 +27,19 @@ def draw(num_rows):
 
 
 SOME = Simulations(*draw(3), torch.rand(3, 3))
+
+
+@contextmanager
+def forked(function):
+    """Yield a process of a function's own, which needs no imports and has to end."""
+    process = get_context("fork").Process(target=function)
+    process.start()
+    try:
+        yield process
+        process.join()
+        assert process.exitcode in (0, -signal.SIGKILL)
+    finally:
+        process.kill()
 
 
 @pytest.fixture
@@ -108,8 +121,8 @@ def test_readers_go_on_while_another_process_writes(bank):
             time.sleep(0.002)  # however fast the disk is, a reader comes in between
 
     lengths = []
-    with forked(write) as is_running:
-        while is_running():
+    with forked(write) as writer:
+        while writer.is_alive():
             reader = Bank(bank.path)
             lengths.append(len(reader))
             rows = slice(0, lengths[-1])
@@ -146,14 +159,15 @@ def test_the_lock_goes_with_its_process(bank):
         append(own, SOME, 0)
         time.sleep(60)
 
-    with forked(hold) as is_running:
+    with forked(hold) as holder:
         other = Bank(bank.path, simulator=simulator)
         while not len(other):
-            assert is_running()
+            assert holder.is_alive()
         with pytest.raises(LockedError, match="expected no other writer"):
             append(other, SOME, 0)
-        os.kill(is_running.pid, signal.SIGKILL)
-        assert is_running.join() == -signal.SIGKILL
+        holder.kill()
+        holder.join()
+        assert holder.exitcode == -signal.SIGKILL
         append(other, SOME, 0)
         other.close()
 
@@ -169,8 +183,9 @@ def test_a_forked_child_reads_and_has_no_right_to_write(bank):
         with pytest.raises(LockedError, match="expected no other writer"):
             append(bank, rows, 1)
 
-    with forked(work) as is_running:
-        assert is_running.join() == 0
+    with forked(work) as reading:
+        reading.join()
+        assert reading.exitcode == 0
     assert append(bank, rows, 2) == 10
     with pytest.raises(LockedError):  # the child's end gave nothing back
         append(Bank(bank.path, simulator=simulator), rows, 3)
@@ -180,8 +195,9 @@ def test_a_forked_child_reads_and_has_no_right_to_write(bank):
         with bank:
             assert append(bank, rows, 4) == 10
 
-    with forked(write) as is_running:
-        assert is_running.join() == 0
+    with forked(write) as writing:
+        writing.join()
+        assert writing.exitcode == 0
     assert len(reader) == len(bank) == 30
 
 
@@ -213,41 +229,6 @@ def test_a_log_that_nothing_was_written_to_is_empty(bank):
     Bank(bank.path).verify()
     append(bank, simulate(simulator, *draw(10), seed=1), 1)
     assert len(Bank(bank.path)) == 20
-
-
-class forked:  # noqa: N801
-    """A function in a process of its own, which needs no imports."""
-
-    def __init__(self, function):
-        self.pid = os.fork()
-        if self.pid == 0:
-            status = 1
-            try:
-                function()
-                status = 0
-            except BaseException:
-                traceback.print_exc()
-            os._exit(status)
-        self.code = None
-
-    def __call__(self):
-        if self.code is None:
-            pid, status = os.waitpid(self.pid, os.WNOHANG)
-            self.code = os.waitstatus_to_exitcode(status) if pid else None
-        return self.code is None
-
-    def join(self):
-        while self():
-            time.sleep(0.01)
-        return self.code
-
-    def __enter__(self):
-        return self
-
-    def __exit__(self, kind, *_):
-        if kind is not None and self():
-            os.kill(self.pid, signal.SIGKILL)
-        assert kind or self.join() in (0, -signal.SIGKILL)
 
 
 # Rows that are weighted for another belief

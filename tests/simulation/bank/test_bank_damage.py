@@ -80,9 +80,7 @@ def changed(name, place, value):
 
 X = np.zeros((5, 2), np.float32).tobytes()
 SEGMENTS = {
-    "no rows": ("rows", b""),
     "other rows than x": ("rows", head(ROWS[:3])),
-    "deep": ("rows", b"[" * 100_000 + b"]" * 100_000),
     "an outcome of 7": ("rows", changed("status", 0, 7)),
     "an index of -1": ("rows", changed("index", 2, -1)),
     "a short column": ("x of rows", X[:-16]),
@@ -108,7 +106,6 @@ STATEMENTS = {
     "no header": "UPDATE records SET content = 'a' WHERE kind = 'bank rows'",
     "a trigger": "CREATE TRIGGER t AFTER INSERT ON records BEGIN DELETE FROM records;"
     " END",
-    "another table": "CREATE TABLE t (a)",
     "an index": "CREATE INDEX i ON records (upper(kind))",
 }
 

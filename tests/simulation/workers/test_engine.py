@@ -1,6 +1,5 @@
 """Seeds, workers, batches, stores and interruptions of the engine."""
 
-import gc
 import os
 import signal
 import sys
@@ -324,8 +323,3 @@ def test_the_pace_is_known_by_the_simulator():
     assert pace_of(Robot()) is not pace_of(Robot())
     assert isinstance(pace_of(Robot().run), Pace)
     assert isinstance(pace_of(torch.add), Pace)
-    before = pace_of(model := SimulatorModel(lambda t, a: t))
-    assert pace_of(model) is before
-    del model
-    gc.collect()
-    assert pace_of(SimulatorModel(lambda t, a: t)) is not before
