@@ -19,7 +19,7 @@ from sbi_active import Campaign
 from sbi_active.campaign.watch import server_of
 from sbi_active.cli import main
 from tests.cli.sled import forked
-from tests.display.browser import assert_reads_well, browser
+from tests.display.browser import assert_reads_well
 from tests.simulation.bank.filled import execute
 
 ROOT = Path(__file__).parents[2]
@@ -94,30 +94,20 @@ campaign.close()
 """
 
 
-def test_a_browser_sees_rounds_of_another_process_come_in(tmp_path):
+def test_rounds_of_another_process_come_in(tmp_path):
     folder = tmp_path / "c"
-
-    def goes_on():
+    words = [sys.executable, "-c", ROUNDS, str(folder)]
+    process = subprocess.Popen(words, cwd=ROOT, stdin=subprocess.PIPE, text=True)
+    while not (folder / "campaign.toml").exists():
+        assert process.poll() is None
+        time.sleep(0.1)
+    with watched(folder) as url:
+        for num in range(1, 4):
+            print(file=process.stdin, flush=True)
+            wait_for(f"{num} trial{'s' * (num > 1)} told", url)
         print(file=process.stdin, flush=True)
-
-    with browser(tmp_path) as seen:
-        words = [sys.executable, "-c", ROUNDS, str(folder)]
-        process = subprocess.Popen(words, cwd=ROOT, stdin=subprocess.PIPE, text=True)
-        while not (folder / "campaign.toml").exists():
-            assert process.poll() is None
-            time.sleep(0.1)
-        with watched(folder) as url:
-            seen.open(url)
-            told = []
-            for num in range(1, 4):  # nothing is clicked
-                goes_on()
-                told.append(seen.wait_for(f"{num} trial{'s' * (num > 1)} told"))
-            goes_on()
-            seen.wait_for("trial 3 waits for its outcome")
-            assert seen.run("return document.images[0].naturalWidth") > 300
-        seen.wait_for("does not answer")
+        wait_for("trial 3 waits for its outcome", url)
     assert process.wait(timeout=60) == 0
-    assert ["a process has it open" in page for page in told] == [True] * 3
     assert len(Campaign.load(folder).history) == 3
 
 

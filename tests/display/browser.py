@@ -4,15 +4,10 @@ import base64
 import json
 import re
 import shutil
-import socket
 import subprocess
-import time
-from contextlib import contextmanager
 from html import unescape
 from html.parser import HTMLParser
 from pathlib import Path
-from urllib.error import URLError
-from urllib.request import Request, urlopen
 
 import pytest
 
@@ -67,90 +62,6 @@ def assert_reads_well(page: str, folder: Path) -> None:
             for is_drawn, words in found["images"]:
                 assert is_drawn
                 assert len(words) > 40
-
-
-# A browser that goes on: chromedriver, spoken to in JSON over HTTP as W3C has it
-
-
-DRIVER = shutil.which("chromedriver")
-
-
-class Browser:
-    """A session of a browser.
-
-    Args:
-        url: Address of the session.
-    """
-
-    def __init__(self, url: str) -> None:
-        self.url = url
-
-    def open(self, page: str) -> None:
-        """Open an address."""
-        said(f"{self.url}/url", {"url": page})
-
-    def run(self, script: str):
-        """Return what a script in the page returns."""
-        return said(f"{self.url}/execute/sync", {"script": script, "args": []})
-
-    def text(self) -> str:
-        """Return what a reader of the page sees."""
-        return self.run("return document.body ? document.body.innerText : ''")
-
-    def wait_for(self, text: str, seconds: float = 120.0) -> str:
-        """Return the page's text once it has a text; it may load itself again."""
-        until = time.monotonic() + seconds
-        while text not in (shown := self.text()):
-            assert time.monotonic() < until, shown
-            time.sleep(0.2)
-        return shown
-
-
-@contextmanager
-def browser(folder: Path):
-    """Yield a browser whose profile is in a folder."""
-    if CHROMIUM is None or DRIVER is None:
-        pytest.skip("Chromium and chromedriver are not installed here: nobody watches")
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
-    own = [flag for flag in FLAGS if flag.startswith("--") and "dump" not in flag]
-    own = [flag for flag in own if "virtual" not in flag and "logging" not in flag]
-    own += [f"--user-data-dir={folder / 'profile'}"]
-    driver = subprocess.Popen(
-        [DRIVER, f"--port={port}"], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
-    )
-    try:
-        base = f"http://127.0.0.1:{port}"
-        until = time.monotonic() + 60
-        while not ready(base):
-            assert time.monotonic() < until
-            time.sleep(0.1)
-        options = {"binary": CHROMIUM, "args": own}
-        wanted = {"alwaysMatch": {"goog:chromeOptions": options}}
-        session = said(f"{base}/session", {"capabilities": wanted})["sessionId"]
-        try:
-            yield Browser(f"{base}/session/{session}")
-        finally:  # which ends the browser
-            said(f"{base}/session/{session}", None, "DELETE")
-    finally:
-        driver.terminate()
-        driver.wait(timeout=60)
-
-
-def ready(base: str) -> bool:
-    """Return whether the driver takes sessions."""
-    try:
-        return said(f"{base}/status", None, "GET")["ready"]
-    except (URLError, OSError):
-        return False
-
-
-def said(url: str, content, method: str = "POST"):
-    """Return the value that a request is answered with."""
-    data = None if content is None else json.dumps(content).encode()
-    with urlopen(Request(url, data, method=method), timeout=120) as answer:
-        return json.loads(answer.read())["value"]
 
 
 # The elements and texts of a page
