@@ -106,8 +106,9 @@ def test_rounds_of_another_process_come_in(tmp_path):
             print(file=process.stdin, flush=True)
             wait_for(f"{num} trial{'s' * (num > 1)} told", url)
         print(file=process.stdin, flush=True)
-        wait_for("trial 3 waits for its outcome", url)
-    assert process.wait(timeout=60) == 0
+        assert process.wait(timeout=60) == 0
+        state = json.loads(ask(url, "/state"))
+        assert state["doing"] == "trial 3 waits for its outcome"
     assert len(Campaign.load(folder).history) == 3
 
 
