@@ -180,7 +180,7 @@ class InformationGainDesigner(Shown):
         )
         learns = estimator is not None and estimator.needs_model
         listed, notes = limits.listed()
-        budget = self._budget(budget, listed)
+        budget = 0 if simulations is not None else self._budget(budget, listed)
         steps: list[Design] = []
         for k in range(num_actions):
             own = derive_seed(seed, "action", k) if k else seed
@@ -189,7 +189,7 @@ class InformationGainDesigner(Shown):
                 estimator = ModelIndexGain(sampler.probability)
             elif simulations is not None:
                 sampler = GivenSampler(simulations, limits)
-                listed, budget = sampler.action, 0
+                listed = sampler.action
             else:
                 probed = listed
                 if probed is None:

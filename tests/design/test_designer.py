@@ -236,7 +236,8 @@ def test_given_simulations_need_no_others(estimator):
     assert "too high where the model was trained on them" in design.notes[0]
     require_near(design, information(VALUES[:, None]))
     dearer = lambda action: 1 + action[:, 0] ** 3  # noqa: E731, .35 against .18
-    again = designer.select(ExactModel(), simulations=given, seed=0, cost=dearer)
+    known = {"simulations": given, "budget": 1}  # nothing is to be spent
+    again = designer.select(ExactModel(), **known, seed=0, cost=dearer)
     assert again.action.tolist() == [1.0]
 
 

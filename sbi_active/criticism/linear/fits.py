@@ -6,7 +6,7 @@ fit, which whatever is linear rests on.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -205,7 +205,7 @@ def refitted(
     model: LinearModel,
     unit: Array,
     kept: Array,
-    near: Sequence[Array] = (),
+    near: Iterable[Array] = (),
 ) -> Array:
     """Return the best fit of a model to some of the numbers, shape (d,).
 

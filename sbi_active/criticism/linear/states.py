@@ -199,7 +199,7 @@ class States:
             u, some = search.rivals.prior_draws, np.resize(kept, len(units))
             square = ((rival.residual(u)[0] / units)[:, some] ** 2).sum(1)
             near = u[np.argsort(square)[: search.settings.num_kept]]
-        u = refitted(rival, own.model, units, kept, [*near])
+        u = refitted(rival, own.model, units, kept, near)
         model = centered(rival, linearize(rival, u, units), units)
         return replace(own, model=model, grams=search.errors.grams(model))
 

@@ -305,8 +305,9 @@ class Contents:
 
     @property
     def rmse_of_others(self) -> tuple[float, float]:
-        """RMSE before and after over the scored trials that have no gross error."""
-        assert self.evaluation is not None
+        """RMSE before and after of scored trials without a gross error; NaN of none."""
+        if self.evaluation is None:
+            return np.nan, np.nan
         kept = self._agreeing(self.evaluation.names)
         scores = self.evaluation.before, self.evaluation.after
         each = [s.loc[kept, ["square", "count"]].sum().to_numpy() for s in scores]
